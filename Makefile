@@ -7,7 +7,7 @@ QUICK := build/quick
 .PHONY: help leaderboard tuning records ladder controls unfinished docs site benchmark test test-long test-slow libero-test check wheel-test clean
 
 define HELP
-make leaderboard  from nothing to a table in minutes: install, run two methods with one seed
+make leaderboard  install, run two methods with one seed, and show a table, in minutes
 make test         most of the tests, in minutes
 make test-long    the tests that take a second and more, many of them whole runs
 make test-slow    the tests that take minutes each
@@ -20,7 +20,7 @@ make tuning       missing tuning runs, and the settings of the methods
 make records      missing records of the boards, then the leaderboard
 make ladder       missing records of the ladder of learning rates
 make controls     missing records that only the claims need
-make unfinished   missing records of boards that have not all of theirs yet
+make unfinished   missing records of boards that are not complete yet
 make benchmark    speed, in two hours on an idle machine
 make clean        delete .venv, build and dist
 endef

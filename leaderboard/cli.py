@@ -64,9 +64,9 @@ def show(
         scenario: Show this scenario alone.
         sort: Name or title of the metric that orders the rows of each division, for example kept.
         records: Folder of the records.
-        published: First copy the records that come with clbench to the folder, where it lacks them: your rows
-            then stand beside the published ones.
-        as_json: Print a JSON list with an object for each row, which has every metric and cost, and write no
+        published: First copy published records that the folder lacks, so that the table shows your rows
+            together with the published ones.
+        as_json: Print a JSON list with an object for each row, with every metric and cost, and write no
             files. Standard error says which records are not shown.
     """
     from clbench.scoring.metrics import load_metric
@@ -161,7 +161,7 @@ def submit(
 
     The check takes seconds on a toy scenario and reports what to fix. Each run has its own process, which is
     stopped if it exceeds the scenario's limits on time, memory and written bytes. Runs with a record are
-    skipped. Submitting runs the method's code as you: read the code first if it is not yours.
+    skipped. This runs the method's code with your rights: read code from others first.
 
     Args:
         method: module:Class, or the name of an installed method.
@@ -170,8 +170,8 @@ def submit(
         seeds: Number of seeds.
         first_seed: The first seed.
         order: Order of the targets, for scenarios with one published order: 0 is that order, other numbers
-            are permutations. Rows are made of order 0. Scenarios whose seeds have orders of their own, such
-            as Fetch-v1, take 0 alone.
+            are permutations. Only order 0 makes rows. Scenarios with a separate order for each seed, such
+            as Fetch-v1, accept only 0.
         workers: Number of runs at once, each a process with one thread (default: all cores).
         records: Folder of the records.
         device: Device on which policies are computed, for example cpu or cuda.
@@ -235,15 +235,16 @@ def verify(
         tier: Highest tier to check: recomputed, replayed or retrained.
         episodes: Number of episodes to replay.
         seed: Random seed that selects the episodes (default: random; keep it secret from the submitter).
-        method: module:Class of the method, if it is not installed: it is imported, and its code runs as you.
-        policy: module:Class of the policy, if it is not built in: it is imported, too.
+        method: module:Class of the method, if it is not installed: clbench runs its code with your rights.
+        policy: module:Class of the policy, if it is not built in: clbench runs its code, too.
         scenario: module:id of the scenario, if clbench does not register it.
         checkpoints: Folder of policies from `clbench run --checkpoints` (default: train them again).
         pretrain: At the tier retrained, also repeat the pretraining (default: use the cached policy).
         by: Your name, for the file (default: none).
         workers: Number of verifications at once, each a process with one thread (default: all cores).
         records: Folder of the records.
-        as_json: Print JSON: of each record whether it passed, its tier, the checks and the failure.
+        as_json: Print a JSON list that states for each record whether it passed, its tier, checks and
+            failure.
     """
     from .board.tiers import TIERS, tier_of
     from .submission.subject import Request

@@ -71,10 +71,10 @@ def cache(
     """Show what the cache and the Minari datasets of clbench hold, and which entries are stale.
 
     An entry is stale if it has not been used for --older-than days, if newer code has made its replacement
-    since its last use, or if a killed process left it behind. An entry at which a process is at work, such as
-    a run in progress, is never stale. The cache holds no records, and everything in it can be made again.
-    Files that clbench did not make are never deleted: an entry that holds one is named, and left as it is.
-    Where the file system does not note when a file is read, an entry counts as used when it was made.
+    since its last use, or if a killed process left it behind. An entry that a process is using, such as a run
+    in progress, is never stale. The cache holds no records, and clbench can make everything in it again.
+    clbench never deletes files that it did not make: it names an entry with such a file, and leaves it as it
+    is. On a file system without access times, an entry counts as used when it was made.
 
     Args:
         prune: List the stale entries, and delete them.

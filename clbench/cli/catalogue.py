@@ -126,7 +126,7 @@ def metrics(
     Args:
         name: Name of a metric, for example forgetting, or a CSV file.
         retained: Tasks of the file that are known before stage 1 and never trained again.
-        target: Tasks of the file that are learned, in their order; without it, all others as in the file.
+        target: Tasks of the file that are learned, in this order (default: all other tasks, as in the file).
         held_out: Tasks of the file that are never trained.
         unit: Unit of the file's rates; without it, they are shares unless one is above 1.
         markdown: Write the page of all metrics to this file, for example docs/reference/metrics.md, and show

@@ -55,7 +55,7 @@ def demonstrations(
     *,
     workers: Annotated[int | None, whole_number(1)] = None,
 ) -> None:
-    """Collect the expert demonstrations of SCENARIO as Minari datasets, and list these.
+    """Collect the expert demonstrations of SCENARIO as Minari datasets, and list the datasets.
 
     Args:
         scenario: Gymnasium id of the scenario.
@@ -94,8 +94,8 @@ def export(
 ) -> None:
     """Export the demonstrations of SCENARIO, or of TASKS alone, for other libraries.
 
-    They are collected first if they are missing. In both formats the actions are the expert's; where action
-    noise replaced one, `noisy` is true and `executed` holds the action that led to the next state.
+    The command first collects missing demonstrations. In both formats, the actions are the expert's. Where
+    noise replaced an action, `noisy` is true and `executed` holds the action that led to the next state.
 
     Args:
         scenario: Gymnasium id of the scenario.
@@ -127,18 +127,18 @@ def import_(
     *,
     state: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = ("states",),
 ) -> None:
-    """Import recorded demonstrations: TASK of a SCENARIO of your own learns from the HDF5 file PATH.
+    """Import recorded demonstrations from the HDF5 file PATH for TASK of your own SCENARIO.
 
     The file has the layout of robomimic and LIBERO: one group data/demo_i for each demonstration, with
     actions, states, rewards, dones and obs. It must fit the world, the horizon and the instructions of the
-    task, and have as many demonstrations as the budget. The task names the demonstrations in the place of an
-    expert; without that, the command checks the file and says what to write.
+    task, and have as many demonstrations as the budget. The task must name the demonstrations instead of
+    an expert. If it does not, the command checks the file and prints the name to write.
 
     Args:
         scenario: Gymnasium id of the scenario, as module:id.
         task: Name of the task.
         path: The HDF5 file.
-        state: Datasets of each demonstration that make, side by side, the state of the world, for example
+        state: Datasets of each demonstration to concatenate into the state of the world, for example
             obs/ee_states obs/gripper_states.
     """
     from clbench.exchange.demonstrations import import_demonstrations

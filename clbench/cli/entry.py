@@ -59,7 +59,7 @@ def main() -> None:
             raise
     if _interrupted():
         _end_at_once_when_stopped()
-        print("Stopped. Finished records are kept; the same command continues.", file=sys.stderr)  # noqa: T201
+        print("Stopped. Finished records are kept; repeat the command to continue.", file=sys.stderr)  # noqa: T201
         sys.exit(INTERRUPTED)
 
 

@@ -54,8 +54,9 @@ def film(
 ) -> None:
     """Film METHODS on SCENARIO: their policies side by side, from the same initial states.
 
-    One method is shown after each stage, several are shown before the first target and after the last. The
-    policies are those that `clbench run` kept. If it kept none, they are made again without evaluation.
+    With one method, the film shows the policy after each stage; with several, before the first target and
+    after the last. It uses the policies that `clbench run` kept. If there are none, clbench trains them
+    again, without evaluation.
 
     Args:
         scenario: Gymnasium id of the scenario.

@@ -67,7 +67,7 @@ def run(
     """Run METHODS on SCENARIOS, once per seed, and write a record of each run.
 
     The command first makes missing inputs: demonstrations, then a pretrained policy for each seed. It skips
-    runs that have a record, so the same command continues a stopped one.
+    runs that have a record: repeat a stopped command to continue it.
 
     Args:
         scenarios: Gymnasium id of the scenario, for example clbench/Fetch-v1, or several ids separated by
@@ -77,10 +77,11 @@ def run(
         seeds: Number of seeds.
         first_seed: The first seed.
         order: Order of the targets, for scenarios with one published order: 0 is that order, other numbers
-            are permutations. From them the leaderboard reports how much scores depend on the order. Scenarios
-            whose seeds have orders of their own, such as Fetch-v1, take 0 alone.
-        policy: flow, discrete_diffusion, or a class of your own as module:Class. Each has rows of its own.
-        policy_size: small, base (5 million parameters) or large (40 million) for the built-in ones.
+            are permutations. The leaderboard uses them to report how much scores depend on the order.
+            Scenarios with a separate order for each seed, such as Fetch-v1, accept only 0.
+        policy: flow, discrete_diffusion, or a class of your own as module:Class. Each policy
+            has separate rows.
+        policy_size: small, base (5 million parameters) or large (40 million), for built-in policies.
         perturb: Also evaluate the skills and each new target in perturbed worlds: other start poses, heavier
             or lighter objects and, in pictures, another camera and light. Such a record replaces a record
             without perturbed episodes, as it holds the same episodes and more.
@@ -90,13 +91,13 @@ def run(
             one.
         records: Folder of the records.
         device: Device on which policies are computed, for example cpu or cuda.
-        changes: Hyper-parameters that differ from those tuned for the scenario or, without tuning, from the
-            method's defaults, as --set.name value. Such a run has a record of its own, which the
+        changes: Hyper-parameters to change, as --set.name value. All others keep the values tuned for the
+            scenario or, without tuning, the method's defaults. Such a run gets a separate record, which the
             leaderboard does not show.
-        checkpoints: Keep the policies of all stages below this folder. Policies of runs that already have a
-            record are made again.
+        checkpoints: Save the policies of all stages below this folder. If a run already has a record, its
+            policies are trained again.
         tensorboard: Log the runs for TensorBoard below this folder while they run.
-        dry_run: Only say what would be done, with the time and the disk to expect.
+        dry_run: Only show what the command would do, with the expected time and disk space.
         quiet: Print nothing but failures.
     """
     with checked_input():
@@ -149,25 +150,25 @@ def score(
     restart: Annotated[bool, Parameter(negative="")] = False,
     records: Path = RECORDS,
 ) -> None:
-    """Score a policy that a server offers on SCENARIO, after each stage of its fine-tuning elsewhere.
+    """Score a served policy on SCENARIO, after each stage of its fine-tuning in another program.
 
-    Score each stage once and in order: 0 before the first target, k after fine-tuning on target k. A stage
-    that is done is skipped. The last stage writes the record. If the server is not up yet, the command waits
-    for it for 10 minutes.
+    Score each stage once and in order: 0 before the first target, k after fine-tuning on target k. The
+    command skips finished stages. The last stage writes the record. If the server is not up yet, the command
+    waits up to 10 minutes.
 
     Args:
         scenario: Gymnasium id of the scenario.
         policy: Address of the server, ws://host:port. docs/guide/external.md shows how to serve a policy.
-        stage: Stage after whose fine-tuning the policy is evaluated.
+        stage: Stage after which the policy is evaluated.
         method: Name of the row on the leaderboard, for example me/lora.
         seed: Seed of the run. It chooses the initial states, the same for all methods.
         execute: Actions of each chunk that are executed before the policy acts again (default: all). The
             number is the same in all stages.
         data: What the policy was trained on in this stage, in words. The record keeps it.
         steps: Optimiser steps of the stage. The record keeps them.
-        timeout: Seconds that a reply may take; a first one may include compilation.
-        restart: Score the stage although it is done: it is dropped, and later stages with it. A finished
-            record stays.
+        timeout: Time limit of a reply in seconds; the first reply may include compilation.
+        restart: Score a finished stage again. This drops the stage and all later ones, but never a finished
+            record.
         records: Folder of the records.
     """
     check_names([scenario], [])

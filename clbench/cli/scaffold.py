@@ -130,8 +130,8 @@ def check_new_name(name: str, kind: str) -> None:
         near = re.sub(r"\W+|(?<=[a-z0-9])(?=[A-Z])", "_", name, flags=re.ASCII).lower().strip("_0123456789")
         hint = f" Did you mean {near!r}?" if re.fullmatch("[a-z][a-z0-9_]{0,49}", near) else ""
         raise InputError(
-            f"{quoted(name)} cannot be the name of a module: it must have at most 50 small letters, digits "
-            f"and _, a letter first.{hint}"
+            f"{quoted(name)} cannot be the name of a module: it must begin with a letter, and have at most "
+            f"50 lowercase letters, digits and _.{hint}"
         )
     if keyword.iskeyword(name):
         raise InputError(f"{name!r} is a Python keyword. Did you mean {f'{name}_{kind}'!r}?")

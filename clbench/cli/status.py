@@ -69,8 +69,8 @@ def status(
     """Show which runs are done, running, failed and to do, and the time left.
 
     Without arguments the command shows every run in the folder of records. With the arguments of
-    `clbench run` it shows those runs, also those that nobody has begun. It may be asked while other commands
-    or machines work in the same folder.
+    `clbench run` it shows those runs, including runs that no command has started. You can use it while other
+    commands or machines work in the same folder.
 
     Args:
         scenarios: Gymnasium id of the scenario, or several ids separated by commas.

@@ -58,9 +58,9 @@ def tune(
     """Choose the settings of METHODS for SCENARIO on validation episodes, with equal effort for each method.
 
     Each method runs with four learning rates, then with two values of its own strength at the best of them,
-    or with two more learning rates. All targets are learned, with seeds that no board has, and no test
-    episode is played. Among the settings whose `learned` is at least 0.8, the one with the best final average
-    wins. Runs with a record are skipped: the same command continues a stopped one and shows the choice again.
+    or with two more learning rates. Runs learn all targets, with seeds that no board uses, and play no
+    test episodes. Of the settings with `learned` of at least 0.8, the one with the best final average wins.
+    Runs with a record are skipped: repeat a stopped command to continue it, or to see the choice again.
 
     With --values the methods run with every combination of these values instead, besides plain fine-tuning,
     and nothing is chosen.
@@ -68,19 +68,19 @@ def tune(
     Args:
         scenario: Gymnasium id of the scenario; module:id imports the module first.
         methods: Names of installed methods, or module:Class.
-        every: Tune all installed methods but controls, which have the settings of their method.
+        every: Tune all installed methods except controls, which use the settings of their method.
         seeds: Number of tuning seeds.
-        first_seed: The first of them; the boards report seeds from 0.
-        fixed: Hyper-parameters with the same value in all settings, as --set.name value: those that the
-            scenario determines, such as the length of a schedule.
+        first_seed: The first tuning seed; the boards use seeds from 0.
+        fixed: Hyper-parameters that keep one value in all settings, as --set.name value. Meant for values
+            that the scenario determines, such as the length of a schedule.
         values: Hyper-parameters and the values to try, as --values.tau_start 0.3,1,3
-        targets: Number of targets to learn, from the first, with --values (default: all). Such runs have
-            their records in a folder of their own, for example targets-1 below --records.
+        targets: Number of targets to learn, from the first, with --values (default: all). The
+            records of such runs go to a separate folder, for example targets-1 below --records.
         workers: Number of runs at once, each a process with one thread (default: all cores).
         device: Device on which policies are computed, for example cpu or cuda.
         records: Folder of the records.
-        write: File that receives the chosen settings; those of other methods in it stay. For built-in methods
-            `clbench run` reads methods/tuned/. Nothing is chosen with --values.
+        write: File for the chosen settings; it keeps the settings of other methods. For built-in methods,
+            `clbench run` reads methods/tuned/. Cannot be used with --values.
     """
     check_names([scenario], methods)
     from clbench.learning.registry import load_method
@@ -99,16 +99,16 @@ def tune(
     with checked_input():
         names = chosen_methods(methods, every)
         if targets is not None and not values:
-            raise InputError("--targets goes with --values: settings are chosen on all targets.")
+            raise InputError("--targets needs --values: settings are chosen on all targets.")
         if write is not None and values:
-            raise InputError("--write goes without --values: with them nothing is chosen.")
+            raise InputError("--write cannot be used with --values: it needs a choice of settings.")
         if write is not None and first_seed < FIRST_TUNING_SEED:
             raise InputError(
                 f"--write needs seeds that no board has: --first-seed must be at least {FIRST_TUNING_SEED}, "
                 f"not {first_seed}."
             )
         if fixed and values:
-            raise InputError("--set goes without --values: give the value as --values.NAME.")
+            raise InputError("--set cannot be used with --values: give the value as --values.NAME.")
         if not values:  # their runs would choose settings that no run reads
             names = _without_controls(names, CONTROLS, every)
         check_device(device)

@@ -84,7 +84,7 @@ def set_aside(run: ResolvedRun, records: Path) -> str | None:
     aside = next(one for one in names if not os.path.lexists(one))
     with contextlib.suppress(FileNotFoundError):  # another command was faster
         path.replace(aside)
-    return f"{path}: {fault}. It is set aside as {aside.name}, and the run is done again."
+    return f"{path}: {fault}. It is renamed to {aside.name}, and the run is repeated."
 
 
 def has_code_of(record: Record, run: ResolvedRun) -> bool:

@@ -204,7 +204,7 @@ class Method:
         run was interrupted.
 
         Returns:
-            A flat dictionary of tensors, texts, numbers, truth values and None. `**vars(batch)` stores the
+            A flat dictionary of tensors, strings, numbers, Booleans and None. `**vars(batch)` stores the
             tensors of a `Batch`, and `Batch(**state)` makes it again.
         """
         return {}

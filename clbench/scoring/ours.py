@@ -118,7 +118,7 @@ def kept_over_stages(rates: Rates) -> Array:
     "on it is missing, or all are 0 before a stage.",
 )
 def kept_share(rates: Rates) -> Array:
-    """Share of what was known before a stage that is left at its end, averaged over the stages."""
+    """Share of the success before a stage that remains at its end, averaged over the stages."""
     after, before, _ = _known(rates)
     return average(after / np.where(before > 0, before, np.nan))
 
@@ -155,7 +155,7 @@ def _where(chosen: Array, values: Array) -> Array:
     missing=f"There is no {BASELINE} of the same seeds, or a final average is missing.",
 )
 def gain(rates: Rates) -> Array:
-    """Final average beyond that of plain fine-tuning, seed by seed."""
+    """Final average minus the final average of plain fine-tuning, seed by seed."""
     return final_average(rates) - final_average(rates.references[BASELINE])
 
 
@@ -197,7 +197,7 @@ def criterion_met(rates: Rates) -> Array:
     version=1,
 )
 def speed(rates: Rates) -> Array:
-    """How many times as fast as from scratch targets are learned.
+    """Speed of learning the targets, relative to learning from scratch.
 
     A stage that never meets its criterion counts with all steps of the budget. The value is too low where
     that is a stage of from_scratch, and too high where it is one of the method.
@@ -385,7 +385,7 @@ def shift(rates: Rates) -> Array:
     missing="The scenario has no criterion or retains no skill, or the record is older than this.",
 )
 def instruction_capture(rates: Rates) -> Array:
-    """Episodes in which the latest target is done although a retained skill is asked for."""
+    """Share of episodes in which the policy does the latest target, although a skill is asked for."""
     return average(rates.captured)
 
 
@@ -401,7 +401,7 @@ def instruction_capture(rates: Rates) -> Array:
     "the final policy failed.",
 )
 def relearning_steps(rates: Rates) -> Array:
-    """Optimiser steps to regain the retained skill most lost, after the last target."""
+    """Optimiser steps to relearn the most forgotten retained skill, after the last target."""
     return rates.relearning_steps
 
 

@@ -258,7 +258,7 @@ def _check_fields(cls: type[Method]) -> None:
     for field in fields:
         value = getattr(method, field.name)
         if not _is_plain(value):
-            expected = "numbers, truth values, text, None, or lists of them as hyper-parameters"
+            expected = "numbers, Booleans, strings, None, or lists of them as hyper-parameters"
             raise _misbuilt(expected, f"{field.name} is a {type(value).__name__}")
     if method != cls():
         expected = "equal objects from equal arguments, as in any dataclass"

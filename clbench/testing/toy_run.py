@@ -295,7 +295,7 @@ class ToyRun:
                     found += "; store its tensors, {**vars(batch)}, and restore them, Batch(**state)"
                 elif isinstance(value, np.generic | np.ndarray):
                     found += f"; store {name}.item(), or torch.from_numpy({name})"
-                raise _bad_state("a flat dictionary of tensors, texts, numbers, truth values and None", found)
+                raise _bad_state("a flat dictionary of tensors, strings, numbers, Booleans and None", found)
             if isinstance(value, Tensor):
                 if value.layout is not torch.strided:
                     raise _bad_state("dense tensors", f"{name!r} is sparse; store {name}.to_dense()")

@@ -12,7 +12,7 @@ from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
 from clbench.spec.references import BASELINE
 
-from .agreement import LEAST_ROWS, LEAST_SEEDS, REPLICATES, Agreement, chance_of, kendall_tau
+from .agreement import LEAST_ROWS, LEAST_SEEDS, REPLICATES, Agreement, kendall_tau
 from .rows import Row
 from .summary import METHODS
 
@@ -39,6 +39,9 @@ PREDICTORS: dict[str, Quantity] = {
     "activation drift": _metric("activation_drift"),
 }
 """Quantities of a run that may predict what it forgets, by their names in a sentence."""
+
+BOARDS = 10_000
+"""Boards of equal methods that say how large a tau is by chance; no p is below 0.0001."""
 
 LOST = _less("kept_share")
 """Share of what was known before a stage that is lost at its end, mean over the stages."""
@@ -92,4 +95,27 @@ def prediction_of(name: str, values: Array, replicates: int = REPLICATES) -> Pre
     draws = np.random.default_rng(0).integers(seeds, size=(replicates, seeds))
     drawn = values[:, draws].mean(axis=2)  # (rows, replicates, 2)
     low, high = np.nanpercentile(kendall_tau(drawn[..., 0].T, drawn[..., 1].T), (2.5, 97.5))
-    return Prediction(tau, float(low), float(high), seeds, rows, chance_of(*means), name)
+    return Prediction(tau, float(low), float(high), seeds, rows, chance_of(tau, values), name)
+
+
+def chance_of(tau: float, values: Array, boards: int = BOARDS) -> float:
+    """Return the probability of a tau as large as this, of either sign, if all methods were equal.
+
+    Both quantities come from the same runs, so that their noise correlates: Kendall's own test takes equal
+    methods for different ones. Here the noise of each row, what is left without the means of rows and seeds,
+    is drawn anew by seed with replacement, for both quantities together.
+
+    Args:
+        tau: Kendall's tau of the board.
+        values: The predictor and forgetting by row and seed, (rows, seeds, 2).
+        boards: Number of boards of equal methods.
+    """
+    rows, seeds, _ = values.shape
+    noise = values - values.mean(axis=1, keepdims=True)
+    noise -= noise.mean(axis=0, keepdims=True)
+    generator = np.random.default_rng(0)
+    draws = generator.integers(seeds, size=(boards, rows, seeds))
+    means = noise[np.arange(rows)[:, None], draws].mean(axis=2)  # (boards, rows, 2)
+    taus = kendall_tau(means[..., 0], means[..., 1])
+    taus = taus[np.isfinite(taus)]
+    return float((1 + np.sum(np.abs(taus) >= abs(tau) - 1e-9)) / (1 + len(taus)))

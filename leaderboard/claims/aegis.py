@@ -47,10 +47,12 @@ LOSES_ANSWERS = "A longer or narrower fine-tuning, after which sft has certainly
     AEGIS,
     reported="OK-VQA 60.15 before, 57.36 after; the loss on held-out questions rises within 1,500 steps",
     rule="Judged on a scenario that was made for it and trains one target long past learning: where stages "
-    "end when the target is learned, sft loses less than 0.01 of the answers (findings.md). Holds if sft's "
-    "drop in question accuracy certainly exceeds 0.01 within the first half of the stage; holds in part, "
-    "because it is not rapid, if it does so only by the end; does not hold if the upper end of the drop at "
-    "the end is below 0.01.",
+    "end when the target is learned, sft loses less than 0.01 of the answers (findings.md). Its length "
+    "and its learning rate, 3.3 times that of Fetch-v1, were chosen on seed 100 so that sft loses "
+    "answers; at the rate of Fetch-v1 it lost 0.02 by the end, instead of 0.12. Holds if sft's drop in "
+    "question accuracy certainly exceeds 0.01 within the first half of the stage; holds in part, "
+    "because it is not rapid, if it does so only by the end; does not hold if the upper end of the drop "
+    "at the end is below 0.01.",
     settled="2026-11-23T07:13Z",
     margin="0.01 of the answers",
     scenarios=KNOWLEDGE,

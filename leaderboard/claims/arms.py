@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
-from .claim import Finding, Verdict, best_first
+from .claim import Finding, Verdict, best_first, decided, deciding
 from .evidence import Evidence, Figure
 from .figures import share_afterwards, share_between
 
@@ -51,6 +51,16 @@ def _afterwards(evidence: Evidence, arm: str) -> str:
         f" This leaves out the last tenth and what follows: {later.value:.0%} of its weights, of which "
         f"{between.value:.0%} lie between."
     )
+
+
+def rises_above(bar: float, counting: Iterable[Figure], every: Iterable[Figure]) -> Verdict:
+    """Return whether a figure is above a bar: for one of the arms that count, or for none of all arms."""
+    return decided(holds=any(one.low > bar for one in counting), fails=all(one.high < bar for one in every))
+
+
+def deciding_arm(verdict: Verdict, counting: Iterable[Figure], every: Iterable[Figure], bar: float) -> Figure:
+    """Return the figure that would first change a verdict; only an arm that counts makes a claim hold."""
+    return deciding(verdict, best_first(list(counting if verdict == "holds" else every)), bar)
 
 
 def if_all_counted(arms: Sequence[str], verdict: Verdict, of_all: Verdict) -> tuple[str, ...]:

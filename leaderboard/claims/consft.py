@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from ..board.runs import is_number
-from .arms import ARMS, NEEDS_WEIGHTS, arms_that_count, if_all_counted, inactive_sentences, without_an_arm
+from .arms import (
+    ARMS,
+    NEEDS_WEIGHTS,
+    arms_that_count,
+    deciding_arm,
+    if_all_counted,
+    inactive_sentences,
+    rises_above,
+    without_an_arm,
+)
 from .claim import (
     ANYWHERE,
     Finding,
@@ -17,11 +26,9 @@ from .claim import (
     claim,
     decided,
     deciding,
-    not_told_apart,
     what_would_change,
 )
 from .consft_controls import (
-    CONTROLS,
     controls_at_the_full_rate,
     controls_of,
     sft_at_the_rate_of,
@@ -32,8 +39,6 @@ from .evidence import Evidence, Figure, rung
 from .figures import (
     PUBLISHED,
     kept,
-    perturbation_gain,
-    perturbation_loss,
     retention_drop,
     share_afterwards,
     share_between,
@@ -91,9 +96,9 @@ def _what_joint_says(gain: Figure) -> tuple[str, ...]:
     "before the last tenth of the schedule are between 0.01 and 0.9. Holds if the lower end of the "
     "difference in retained success to sft, each at its best settings, is at least 0.20 for an arm; holds in "
     "part if it is so only with both at the scenario's learning rate; does not hold if all upper ends of "
-    "both comparisons are below 0.20. Cannot be shown here if no arm counts, or if sft certainly keeps more "
-    "than 0.80 at both settings.",
-    settled="2026-11-26T20:19Z",
+    "both comparisons are below 0.20 for both arms, counting or not. Cannot be shown here if no arm counts, "
+    "or if sft certainly keeps more than 0.80 at both settings.",
+    settled="2026-11-27T20:50Z",
     margin="0.20 of the retained success, the claim's own",
 )
 def keeps_20_points_more(evidence: Evidence) -> Finding:
@@ -113,6 +118,8 @@ def keeps_20_points_more(evidence: Evidence) -> Finding:
     shares = tuple(one(evidence, arm) for arm in ARMS for one in (share_between, share_afterwards))
     shown = (*sft, *alike, *controls, *controls_at_one, *shares)
     at_one_says = what_the_full_rate_says(best_first(at_one)[0], controls_at_one)
+    every = [*at_best, *at_one]
+    of_all = _keeps_more(at_best, at_one, every)
     if not arms or all(one.low > 0.80 for one in sft):
         reason = ("sft keeps too much for a gain of 0.20.",) if arms else ()
         return Finding(
@@ -122,20 +129,20 @@ def keeps_20_points_more(evidence: Evidence) -> Finding:
             (
                 *inactive_sentences(evidence),
                 *reason,
-                *(() if arms else if_all_counted(arms, "cannot be shown here", _keeps_more(at_best, at_one))),
+                *(() if arms else if_all_counted(arms, "cannot be shown here", of_all)),
                 *at_one_says,
             ),
             "A setting in which sft keeps less than 0.80." if arms else NEEDS_WEIGHTS,
         )
-    verdict = _keeps_more(counting, published)
-    judged = {"holds": counting, "holds in part": published}.get(verdict, [*counting, *published])
+    verdict = _keeps_more(counting, published, every)
+    judged = {"holds": counting, "holds in part": published}.get(verdict, every)
     return Finding(
         verdict,
         figures,
         shown,
         (
             *inactive_sentences(evidence),
-            *if_all_counted(arms, verdict, _keeps_more(at_best, at_one)),
+            *if_all_counted(arms, verdict, of_all),
             *what_controls_say(best, controls, arms),
             *at_one_says,
         ),
@@ -144,12 +151,18 @@ def keeps_20_points_more(evidence: Evidence) -> Finding:
     )
 
 
-def _keeps_more(at_best: Sequence[Figure], at_one: Sequence[Figure]) -> Verdict:
-    """Return the verdict on the gains of some arms, at their best settings and at the scenario's rate."""
+def _keeps_more(at_best: Sequence[Figure], at_one: Sequence[Figure], every: Sequence[Figure]) -> Verdict:
+    """Return the verdict on gains.
+
+    Args:
+        at_best: Gains of the arms that count at their best settings.
+        at_one: Their gains at the scenario's learning rate.
+        every: Both gains of all arms.
+    """
     return decided(
         holds=any(one.low >= 0.20 for one in at_best),
         in_part=any(one.low >= 0.20 for one in at_one),
-        fails=all(one.high < 0.20 for one in (*at_best, *at_one)),
+        fails=all(one.high < 0.20 for one in every),
     )
 
 
@@ -158,44 +171,45 @@ def _keeps_more(at_best: Sequence[Figure], at_one: Sequence[Figure]) -> Verdict:
     CONSFT,
     reported="0.34 on prior tasks against 0.18 with 1:1 replay (pi0, LIBERO, Table 3)",
     rule="Holds if the lower end of the difference in retained success is at least -0.05 against both kinds "
-    "of replay, for one of the arms of C2 that count, all at their best settings; does not hold if each of "
-    "these arms has an upper end below -0.05 against one of them. Cannot be shown here if no arm counts. "
+    "of replay, for one of the arms of C2 that count, all at their best settings; does not hold if both "
+    "arms, counting or not, have an upper end below -0.05 against one of them. Cannot be shown here if no "
+    "arm counts. "
     "Replay draws from the demonstrations of the retained skills themselves, and the note has its tuned "
     "share; the paper compares with pretraining data at 1:1.",
-    settled="2026-11-26T04:12Z",
+    settled="2026-11-27T20:50Z",
     margin="0.05 of the retained success",
 )
 def as_good_as_replay(evidence: Evidence) -> Finding:
     """As good as experience replay, without prior data."""
     replays = ("experience_replay", "buffered_replay")
     every = {arm: [kept(evidence, arm, replay) for replay in replays] for arm in ARMS}
-    of_all, counting = _reaches(every.values()), arms_that_count(evidence)
+    of_all, counting = _reaches(every.values(), every.values()), arms_that_count(evidence)
     arms = [every[arm] for arm in counting]
     if not arms:
         return without_an_arm(evidence, [of_arm[0] for of_arm in every.values()], (), of_all)
-    verdict = _reaches(arms)
+    verdict = _reaches(arms, every.values())
     holding = [arm[0].methods[0] for arm in arms if all(figure.low >= -0.05 for figure in arm)]
-    figures = best_first([arm[0] for arm in arms])
+    others = [figure for arm in ARMS if arm not in counting for figure in every[arm]]
+    deciders = arms if verdict == "holds" else every.values()
     sentences = [f"It holds for {' and '.join(holding)}."] if holding else []
     if verdict == "does not hold":
         names = " and ".join(arm[0].methods[0] for arm in arms)
         sentences = [f"Replay{_share_of_replay(evidence)} certainly keeps more skills than {names}."]
     return Finding(
         verdict,
-        figures,
-        tuple(arm[1] for arm in arms),
+        best_first([arm[0] for arm in arms]),
+        (*(arm[1] for arm in arms), *others),
         (*inactive_sentences(evidence), *if_all_counted(counting, verdict, of_all), *sentences),
-        what_would_change(figures[0], -0.05),
+        what_would_change(best_first([arm[0] for arm in deciders])[0], -0.05),
         about=ARMS,
     )
 
 
-def _reaches(arms: Iterable[Sequence[Figure]]) -> Verdict:
-    """Return the verdict on the differences of some arms to both kinds of replay."""
-    found = list(arms)
+def _reaches(counting: Iterable[Sequence[Figure]], every: Iterable[Sequence[Figure]]) -> Verdict:
+    """Return the verdict on the differences to both kinds of replay, of the arms that count and of all."""
     return decided(
-        holds=any(all(figure.low >= -0.05 for figure in arm) for arm in found),
-        fails=all(any(figure.high < -0.05 for figure in arm) for arm in found),
+        holds=any(all(figure.low >= -0.05 for figure in arm) for arm in counting),
+        fails=all(any(figure.high < -0.05 for figure in arm) for arm in every),
     )
 
 
@@ -214,10 +228,10 @@ def _share_of_replay(evidence: Evidence) -> str:
     CONSFT,
     reported="a curve without numbers: sparsity decays later and more evenly than with sft (Fig. 2)",
     rule="Update sparsity after the last target, each method at its best settings. Holds if the lower end "
-    "of the difference to sft is above 0.05 for one of the arms of C2 that count; does not hold if all their "
-    "upper ends are below 0.05. Cannot be shown here if the measure does not notice a penalty on moved "
-    "weights (l2_sp's difference to sft has an upper end below 0.05), or if no arm counts.",
-    settled="2026-11-26T04:12Z",
+    "of the difference to sft is above 0.05 for one of the arms of C2 that count; does not hold if the upper "
+    "ends of both arms, counting or not, are below 0.05. Cannot be shown here if no arm counts, or if the "
+    "measure does not notice a penalty on moved weights (l2_sp's difference has an upper end below 0.05).",
+    settled="2026-11-27T20:50Z",
     margin="0.05 of the parameters",
 )
 def stays_sparse(evidence: Evidence) -> Finding:
@@ -243,11 +257,8 @@ def stays_sparse(evidence: Evidence) -> Finding:
         )
     responds = response.high >= 0.05  # not known without l2_sp
     verdict, of_all = (
-        decided(
-            holds=responds and any(one.low > 0.05 for one in some),
-            fails=responds and all(one.high < 0.05 for one in some),
-        )
-        for some in (arms, list(every.values()))
+        rises_above(0.05, some, every.values()) if responds else "undecided"
+        for some in (arms, every.values())
     )
     more = (
         f"A penalty on moved weights keeps {response.value:.3f} more of them in place; weighing samples does "
@@ -256,13 +267,13 @@ def stays_sparse(evidence: Evidence) -> Finding:
     return Finding(
         verdict,
         figures,
-        (response,),
+        (response, *(every[arm] for arm in ARMS if arm not in counting)),
         (
             *inactive_sentences(evidence),
             *if_all_counted(counting, verdict, of_all),
             *([more] if verdict == "does not hold" else []),
         ),
-        what_would_change(deciding(verdict, figures, 0.05) if responds else response, 0.05),
+        what_would_change(deciding_arm(verdict, arms, every.values(), 0.05) if responds else response, 0.05),
         about=ARMS,
     )
 
@@ -325,120 +336,4 @@ def costs_nothing(evidence: Evidence) -> Finding:
         (bytes_of_sft, added_by_sft),
         (),
         what_would_change(time, 1.05),
-    )
-
-
-@claim(
-    "C7",
-    CONSFT,
-    reported="the abstract says that pretrained skills are kept while targets are acquired in sequence; that "
-    "earlier targets are kept is our reading, and no number was found",
-    rule="Holds if the lower end of backward transfer is at least -0.10 for one of the arms of C2 that "
-    "count; does not hold if all their upper ends are below -0.10. Cannot be shown here if no arm counts.",
-    settled="2026-11-26T04:12Z",
-    margin="0.10 of the success on earlier targets",
-    ours=True,
-)
-def keeps_earlier_targets(evidence: Evidence) -> Finding:
-    """Learns several targets in sequence and keeps the earlier ones."""
-    own = {arm: evidence.metric("backward_transfer", arm) for arm in ARMS}
-    references = tuple(evidence.metric("backward_transfer", name) for name in ("sft", "experience_replay"))
-    counting, of_all = arms_that_count(evidence), _keeps_targets(list(own.values()))
-    arms = [own[arm] for arm in counting]
-    if not arms:
-        return without_an_arm(evidence, tuple(own.values()), references, of_all)
-    figures = best_first(arms)
-    over_sft, *over_controls = _gains_in_transfer(evidence, figures[0].methods[0])
-    not_counted = [
-        figure
-        for arm in ARMS
-        if arm not in counting
-        for figure in (own[arm], evidence.difference("backward_transfer", arm, "sft"))
-    ]
-    verdict = _keeps_targets(arms)
-    return Finding(
-        verdict,
-        figures,
-        (over_sft, *over_controls, *not_counted, *references),
-        (
-            *inactive_sentences(evidence),
-            *if_all_counted(counting, verdict, of_all),
-            _what_keeps_targets(over_sft, over_controls),
-        ),
-        what_would_change(deciding(verdict, figures, -0.10), -0.10),
-        about=ARMS,
-    )
-
-
-def _keeps_targets(arms: Sequence[Figure]) -> Verdict:
-    """Return the verdict on the backward transfer of some arms."""
-    return decided(holds=any(one.low >= -0.10 for one in arms), fails=all(one.high < -0.10 for one in arms))
-
-
-def _gains_in_transfer(evidence: Evidence, arm: str) -> Iterator[Figure]:
-    """Yield the gain of an arm over sft, over sft at the arm's step factor, and over its controls."""
-    controls = (label for label in CONTROLS if label in evidence.runs)
-    for other in ("sft", *sft_at_the_rate_of(evidence, arm), *controls):
-        yield evidence.difference("backward_transfer", arm, other)
-
-
-def _what_keeps_targets(over_sft: Figure, over_controls: Sequence[Figure]) -> str:
-    """Return what sft and the controls say about an arm's gain in backward transfer."""
-    equal = [one.methods[1] for one in over_controls if not one.low > 0]
-    if over_sft.low > 0 and equal:
-        are = "is" if len(equal) == 1 else "are"
-        return (
-            f"sft at its best learning rate does not reach it, but {' and '.join(equal)} {are} not told "
-            "apart from it: weighing samples need not be the cause."
-        )
-    return not_told_apart(
-        over_sft,
-        explains="weighing samples need not keep any earlier target",
-        does_not="weighing samples keeps earlier targets",
-    )
-
-
-@claim(
-    "C8",
-    CONSFT,
-    reported="one case on a real robot: sft closes the gripper too high, ConSFT does not (Sec. 5.5)",
-    rule="The loss is the success on each new target minus its success in perturbed episodes, in which the "
-    "gripper starts elsewhere and the block weighs half or twice as much. carry_back does not count: it "
-    "begins with the block in the gripper, which no expert can hold if it weighs twice as much. "
-    "Holds if the lower end of sft's loss minus the method's is above 0.05 for one of the arms of C2 that "
-    "count; does not hold if all their upper ends are below 0.05. Cannot be shown here if no arm counts, or "
-    "if the upper end of sft's own loss is below 0.05.",
-    settled="2026-11-26T20:19Z",
-    margin="0.05 of the success",
-    scenarios=ANYWHERE,
-)
-def prevents_spatial_overfitting(evidence: Evidence) -> Finding:
-    """Prevents overfitting to the positions in the demonstrations."""
-    of_sft = perturbation_loss(evidence, "sft")
-    every = [perturbation_gain(evidence, arm, "sft") for arm in ARMS]
-    if of_sft.high < 0.05:
-        return Finding(
-            "cannot be shown here",
-            best_first(every),
-            (of_sft,),
-            (
-                *inactive_sentences(evidence),
-                "sft certainly loses less than 0.05 in perturbed episodes: there is nothing to prevent.",
-            ),
-            "Starts farther from the demonstrated ones, at which sft fails.",
-            about=ARMS,
-        )
-    counting = arms_that_count(evidence)
-    arms = [figure for arm, figure in zip(ARMS, every, strict=True) if arm in counting]
-    if not arms:
-        return without_an_arm(evidence, every, (of_sft,))
-    figures = best_first(arms)
-    verdict = decided(holds=any(one.low > 0.05 for one in arms), fails=all(one.high < 0.05 for one in arms))
-    return Finding(
-        verdict,
-        figures,
-        (of_sft,),
-        inactive_sentences(evidence),
-        what_would_change(deciding(verdict, figures, 0.05), 0.05),
-        about=ARMS,
     )

@@ -6,14 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 
-from . import aegis, consft, fast_dvla
+from . import aegis, consft, consft_targets, fast_dvla
 from .claim import Claim, Finding
 from .evidence import Evidence
 
 CLAIMS: dict[str, Claim] = {
     one.id: one
-    for paper in (consft, aegis, fast_dvla)
-    for one in vars(paper).values()
+    for module in (consft, consft_targets, aegis, fast_dvla)
+    for one in vars(module).values()
     if isinstance(one, Claim)
 }
 """All claims by id, in the order of the page."""

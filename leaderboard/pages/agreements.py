@@ -168,7 +168,7 @@ def _common(
 
 def _seeds_order(found: Concordance) -> str:
     """Return the sentence on how alike the seeds of a board order its methods, in lower case."""
-    words = f"order the {found.rows} methods alike more than chance would explain"
+    words = f"agree on the order of the {found.rows} methods more than chance would explain"
     if not found.certain:
         words = f"show no certain agreement on the order of the {found.rows} methods"
     return f"the {found.seeds} seeds {words} ({concordance_text(found)})"

@@ -56,7 +56,7 @@ def findings(
     controls: Path = CONTROLS,
     output: Path = Path("docs/reference/findings.md"),
 ) -> None:
-    """Say what the records show together, and write a page with every figure, its interval and pictures.
+    """Summarise the records, and write a page with every figure, its interval and charts.
 
     Args:
         records: Folder of the records of the leaderboard.
@@ -110,8 +110,8 @@ def scenario_card(
     """Write the card of each of SCENARIOS: its tasks with pictures, and whether it tells methods apart.
 
     The command measures experts and draws pictures only where they are missing from the folder of the card.
-    Where no renderer works, a card lacks the missing pictures and reports it. Unless it is named, a card
-    whose scenario lacks a package stays as it is.
+    If no renderer works, the command leaves out missing pictures and says so. If a scenario lacks a package,
+    its card stays as it is, unless you name the scenario.
 
     Args:
         scenarios: Gymnasium ids (default: all scenarios with records, or with a card in the folder).

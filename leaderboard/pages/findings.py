@@ -249,7 +249,7 @@ def _grouped(pairs: Iterable[tuple[Key, Value]]) -> dict[Key, list[Value]]:
     return found
 
 
-MADE_FOR_IT = "the one scenario that was made to show it, by training far past learning"
+MADE_FOR_IT = "the one scenario that was made to show it, by training far past learning and in large steps"
 
 
 def _those_that_hold(judged: Sequence[Judged]) -> str:
@@ -291,8 +291,10 @@ def _predictors(boards: dict[str, list[Row]]) -> Section:
     if answers:
         answers.insert(
             0,
-            "Forgetting is here 1 minus the kept share. Methods differ in more than one way, such as their "
-            "learning rate: an order that agrees does not say what causes forgetting.",
+            "Forgetting is here 1 minus the kept share. Both quantities come from the same runs, so p is the "
+            "share of simulated boards of equal methods, with the noise of these runs, that have such a tau. "
+            "Methods differ in more than one way, such as their learning rate: an order that agrees does not "
+            "say what causes forgetting.",
         )
         answers += after_correction([one.chance for _, _, one in found])
         if any(row.method == "stop_gradient" for rows in boards.values() for row in rows):

@@ -98,7 +98,7 @@ def gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[T
     if len(worse) < len(losses):
         rest = {method: loss for method, loss in losses.items() if method not in worse}
         yield f"Lower {alone}: {_listed(rest)}."
-    yield from _over_tied_settings(name, tied, gains)
+    yield from _over_tied_settings(name, tied)
 
 
 def _losses(gains: Mapping[str, Estimate]) -> dict[str, Estimate]:
@@ -110,22 +110,20 @@ def _losses(gains: Mapping[str, Estimate]) -> dict[str, Estimate]:
     }
 
 
-def _over_tied_settings(
-    name: str, tied: Mapping[str, Sequence[TiedGain]], methods: Collection[str]
-) -> Iterator[str]:
-    """Yield how plain fine-tuning at a tied setting compares with the chosen one, and who is below it."""
-    for place, one in enumerate(tied.get(BASELINE, ())):
+def _over_tied_settings(name: str, tied: Mapping[str, Sequence[TiedGain]]) -> Iterator[str]:
+    """Yield how plain fine-tuning at a tied setting compares with the chosen one.
+
+    Methods below it are not named: they have settings that tied, too, of which the board has one.
+    """
+    for one in tied.get(BASELINE, ()):
         more = _losses({BASELINE: one.gain}).get(BASELINE)
-        if more is None:
-            continue
-        below = _losses({method: tied[method][place].gain for method in methods if method in tied})
-        lower = f" Lower than it by their own intervals: {_listed(below)}." if below else ""
-        yield (
-            f"On {name}, tuning rated plain fine-tuning at {rate_text(one.factor)} as highly as at the "
-            f"chosen one. In the test episodes of {counted(one.seeds, 'seed')} it ends "
-            f"{format_interval(more, '.3f')} higher than at the chosen one, and every gain of this board is "
-            f"smaller over it.{lower}"
-        )
+        if more is not None:
+            yield (
+                f"On {name}, tuning rated plain fine-tuning at {rate_text(one.factor)} as highly as at the "
+                f"chosen one. In the test episodes of {counted(one.seeds, 'seed')} it ends "
+                f"{format_interval(more, '.3f')} higher than at the chosen one, and every gain of this board "
+                "is smaller over it."
+            )
 
 
 def _unlearned(rows: Iterable[Row], methods: Collection[str]) -> str:

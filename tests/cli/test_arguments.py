@@ -98,13 +98,13 @@ def test_a_path_may_begin_with_the_home_folder(
             'Invalid value "20" for --size. Must be >= 96.',
         ),
         (["tune", "clbench/Fetch-v1", "sft", "--values.x", "1", "--targets", "0"], "Must be >= 1."),
-        (["tune", "clbench/Fetch-v1", "sft", "--targets", "1"], "--targets goes with --values"),
+        (["tune", "clbench/Fetch-v1", "sft", "--targets", "1"], "--targets needs --values"),
         (
             ["tune", "clbench/Fetch-v1", "sft", "--values.step_factor", "1", "--write", "chosen.json"],
-            "--write goes without --values",
+            "--write cannot be used with --values",
         ),
         (["tune", "clbench/Fetch-v1", "consft", "--set.tau_start", "1"], "Tuning ConSFT sets tau_start"),
-        (["tune", "clbench/Fetch-v1", "sft", "--values.x", "1", "--set.y", "1"], "--set goes without"),
+        (["tune", "clbench/Fetch-v1", "sft", "--values.x", "1", "--set.y", "1"], "--set cannot be used"),
         (
             ["tune", "clbench/Fetch-v1", "sft", "shuffled_weights"],
             "has its settings: tune consft_calibrated.",

@@ -57,7 +57,7 @@ def test_a_class_of_the_script_itself_runs_and_its_change_is_noticed(tmp_path: P
     assert "1 of 1 run has a record already." in again.stderr
     changed = run_script(SCRIPT.replace("0.5", "0.25", 1), tmp_path)
     assert changed.stdout == "__main__:Slow success 0 0.25\n"
-    assert "the code of __main__:Slow has changed since. It is set aside as seed-0.json.old" in changed.stderr
+    assert "the code of __main__:Slow has changed since. It is renamed to seed-0.json.old" in changed.stderr
     kept = sorted(path.name for path in (tmp_path / "records").rglob("*.json*"))
     assert kept == ["seed-0.json", "seed-0.json.old"]
 

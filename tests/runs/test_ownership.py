@@ -264,7 +264,7 @@ def test_a_damaged_record_is_named_set_aside_and_made_again(
     damaged = path.read_bytes()
     resolve("clbench.cli.runs:run")(TOY, "frozen", seeds=1, records=tmp_path)
     said = capsys.readouterr().err
-    assert f"{path.name}.damaged, and the run is done again." in said
+    assert f"{path.name}.damaged, and the run is repeated." in said
     assert ("cannot be read as JSON" if damage == "torn" else "is missing at stage 2, step 60") in said
     assert path.with_name(f"{path.name}.damaged").read_bytes() == damaged
     assert Scores.from_record(read_record(path)).success.shape[0] == 3

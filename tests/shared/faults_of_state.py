@@ -306,7 +306,7 @@ FAULTS_OF_STATE: list[tuple[Any, str, str, str]] = [
     (Prepared, "constructor", "only hyper-parameters to be stored", "it sets buffer"),
     (Rounding, "constructor", "to be kept unchanged", "rate=0.5 becomes 0"),
     (Capped, "constructor", "to be kept unchanged", "rounds=3 becomes 2"),
-    (Loaded, "constructor", "numbers, truth values, text", "weights is a Tensor"),
+    (Loaded, "constructor", "numbers, Booleans, strings", "weights is a Tensor"),
     (Unequal, "constructor", "equal objects from equal arguments", "two objects with the defaults differ"),
     (Learned, "constructor", "every field to be a hyper-parameter", "anchor has init=False"),
     (
@@ -321,7 +321,7 @@ FAULTS_OF_STATE: list[tuple[Any, str, str, str]] = [
     (Reseeds, "seeding", "draw, but do not seed", "after batch() numpy.random is in the same state"),
     (Anchored, "state", "a new object that has only what load_state() sets", "no attribute 'anchor'"),
     (Restarts, "state", "state() to return everything that later stages need", "differs in stage 2 (down)"),
-    (Structured, "state", "a flat dictionary of tensors, texts, numbers", "a list, 'losses'"),
+    (Structured, "state", "a flat dictionary of tensors, strings, numbers", "a list, 'losses'"),
     (
         Bundles,
         "state",

@@ -50,9 +50,9 @@ GROUPS = {"retained": "old skills to keep", "target": "new tasks", "held out": "
 """Titles of the groups of tasks."""
 
 TIER_RULES = (
-    "At least one run was checked by its submitter alone.",
-    "The metrics of every run were recomputed from its episodes, or more was done.",
-    "Some episodes of every run were replayed, or more was done.",
+    "At least one run was checked only by its submitter.",
+    "For every run, at least the metrics were recomputed from its episodes.",
+    "For every run, at least some episodes were replayed.",
     "Every run was repeated as a whole.",
 )
 """How the rows of each tier were verified."""

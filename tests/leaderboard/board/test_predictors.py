@@ -8,6 +8,7 @@ from scipy.stats import kendalltau
 
 from clbench.base.entry_points import resolve
 
+chance_of = resolve("clbench.leaderboard.board.predictors:chance_of")
 prediction_of = resolve("clbench.leaderboard.board.predictors:prediction_of")
 predictions = resolve("clbench.leaderboard.board.predictors:predictions")
 
@@ -28,6 +29,42 @@ def test_the_interval_is_that_of_draws_of_seeds_shared_by_rows_and_quantities() 
         means = values[:, draw].mean(axis=1)
         taus.append(kendalltau(means[:, 0], means[:, 1]).statistic)
     assert (found.low, found.high) == pytest.approx(tuple(np.percentile(taus, (2.5, 97.5))))
+
+
+def test_equal_methods_with_noise_that_correlates_seldom_seem_to_be_ordered() -> None:
+    generator = np.random.default_rng(3)
+    covariance = [[1.0, -0.6], [-0.6, 1.0]]
+    kendalls, ours = 0, 0
+    for _ in range(100):
+        values = generator.multivariate_normal([0.0, 0.0], covariance, size=(12, 8))
+        means = values.mean(axis=1)
+        test = kendalltau(means[:, 0], means[:, 1])
+        kendalls += test.pvalue < 0.05
+        ours += chance_of(test.statistic, values, boards=200) < 0.05
+    assert ours <= 12 < kendalls  # 5 are expected; Kendall's test takes the two quantities for unrelated
+
+
+def test_the_probability_of_a_tau_is_that_of_equal_methods_with_the_noise_of_the_board() -> None:
+    values = np.random.default_rng(4).random((6, 5, 2)) + np.arange(6)[:, None, None]
+    noise = [[[0.0, 0.0] for _ in range(5)] for _ in range(6)]
+    for one in range(2):
+        of_row = [sum(values[row, :, one]) / 5 for row in range(6)]
+        of_seed = [sum(values[:, seed, one]) / 6 for seed in range(5)]
+        for row in range(6):
+            for seed in range(5):
+                whole = sum(of_row) / 6
+                noise[row][seed][one] = values[row, seed, one] - of_row[row] - of_seed[seed] + whole
+    drawn = np.random.default_rng(0).integers(5, size=(300, 6, 5))
+    taus = []
+    for board in drawn:
+        means = [
+            [round(sum(noise[row][seed][one] for seed in board[row]) / 5, 9) for row in range(6)]
+            for one in (0, 1)  # rounded: a row whose seeds are drawn once each has a mean of 0, a tie
+        ]
+        taus.append(kendalltau(*means).statistic)
+    assert chance_of(1.0, values, boards=300) == (1 + sum(abs(tau) > 1 - 1e-9 for tau in taus)) / 301
+    assert chance_of(-0.6, values, boards=300) == (1 + sum(abs(tau) > 0.6 - 1e-9 for tau in taus)) / 301
+    assert chance_of(0.0, values, boards=300) == 1.0
 
 
 def test_a_predictor_that_is_equal_everywhere_predicts_nothing() -> None:

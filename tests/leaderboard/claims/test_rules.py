@@ -146,10 +146,10 @@ CASES: list[tuple[str, str, Given]] = [
     ("C6", "undecided", {"sft": {}, "consft": {}}),
     ("C7", "holds", {"consft": {"earlier": 1.0}, "consft_calibrated": {"earlier": 0.4}}),
     ("C7", "does not hold", {"consft": {"earlier": 0.5}, "consft_calibrated": {"earlier": 0.4}}),
-    # an arm whose samples all weigh the same is plain fine-tuning
+    # an arm whose samples all weigh the same shows nothing: it makes no claim hold or fail
     (
         "C7",
-        "does not hold",
+        "undecided",
         {"consft": {"earlier": 1.0, "diagnostics": SAME}, "consft_calibrated": {"earlier": 0.4}},
     ),
     ("C8", "holds", {"sft": {"displaced": 0.5}, "consft": {"displaced": 0.8}}),
@@ -256,7 +256,7 @@ def test_an_arm_that_does_not_count_is_shown_with_the_verdict_that_it_would_give
     bench.add("consft", earlier=1.0, diagnostics=SAME)
     bench.add("consft_calibrated", earlier=0.4, diagnostics=ACTIVE)
     finding = bench.judge("C7")
-    assert finding.verdict == "does not hold"
+    assert finding.verdict == "undecided"
     assert 'If consft counted: "holds".' in finding.sentences
     (same,) = [one for one in bench.judge("C2").sentences if one.startswith("If consft counted")]
     assert same == "If consft counted, the verdict would be the same."

@@ -93,7 +93,7 @@ def test_a_record_of_older_code_is_set_aside_and_kept(capsys: pytest.CaptureFixt
     capsys.readouterr()
     submit("submitted:Mine")
     said = " ".join(capsys.readouterr().err.split())
-    assert "the code of submitted:Mine has changed since. It is set aside as seed-0.json.old" in said
+    assert "the code of submitted:Mine has changed since. It is renamed to seed-0.json.old" in said
     assert path.with_name("seed-0.json.old").read_bytes() == before
     assert read_record(path).fingerprint["method"]["source"] != "another"
 

@@ -146,7 +146,7 @@ def test_a_tier_says_how_many_runs_reached_a_higher_one(records: Path) -> None:
     sentence = "A row has the lowest tier of its runs. Runs with a higher tier: 1 of 4 retrained."
     assert f"4 runs. {sentence}" in words(section)
     assert sentence in markdown(compute_board(records), {})
-    assert "At least one run was checked by its submitter alone." in words(section)
+    assert "At least one run was checked only by its submitter." in words(section)
 
 
 @pytest.mark.long
