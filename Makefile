@@ -29,7 +29,7 @@ endef
 help:
 	@: $(info $(HELP))
 
-# The main job: from nothing to a table in minutes, with one seed. The full board takes `make records`.
+# The main target: install, run and show a table in minutes, with one seed. The full board takes `make records`.
 leaderboard:
 	@start=$$(date +%s) \
 		&& $(MAKE) --no-print-directory .venv/installed \
@@ -95,7 +95,7 @@ ladder: .venv/installed-dev
 	$(BIN)/clbench run $(CLAIMED) consft_calibrated --set.step_factor 1 --seeds 4 --records leaderboard/ladder
 	$(BIN)/clbench run clbench/PointMaze-v1 sft consft fast_dvla --set.step_factor 1 --seeds 4 --records leaderboard/ladder
 
-# What else docs/reference/claims.md needs: methods with one thing changed that tells what their effect is due to.
+# Further records for docs/reference/claims.md: methods with one change that shows what causes their effect.
 KNOWLEDGE := clbench/FetchKnowledge-v1
 CONTROLS := --seeds 4 --records leaderboard/controls
 controls: .venv/installed-dev

@@ -161,7 +161,7 @@ def submit(
 
     The check takes seconds on a toy scenario and reports what to fix. Each run has its own process, which is
     stopped if it exceeds the scenario's limits on time, memory and written bytes. Runs with a record are
-    skipped. This runs the method's code with your rights: read code from others first.
+    skipped. The command runs the method's code with your rights: read code from others first.
 
     Args:
         method: module:Class, or the name of an installed method.
@@ -174,7 +174,7 @@ def submit(
             as Fetch-v1, accept only 0.
         workers: Number of runs at once, each a process with one thread (default: all cores).
         records: Folder of the records.
-        device: Device on which policies are computed, for example cpu or cuda.
+        device: Device that runs the policies, for example cpu or cuda.
         checkpoints: Keep the policies of all stages below this folder, so that `clbench verify` need not make
             them again.
     """
@@ -306,13 +306,13 @@ def _placed(found: list[Path], records: Path) -> tuple[list[Path], Path]:
     for path in absolute:
         if not path.is_relative_to(folder):
             raise InputError(
-                f"{path} is not below {folder}: name its folder of records, in which it is "
-                "SCENARIO/METHOD/seed-N.json, with --records."
+                f"{path} is not below {folder}: give --records the folder in which it is "
+                "SCENARIO/METHOD/seed-N.json."
             )
         in_place = len(path.relative_to(folder).parts) == 3  # then the verification reads it, and not this
         home = None if in_place else _home_of(path)
         if home is not None:
-            raise InputError(f"{path} has its place below {home}: add --records {home}.")
+            raise InputError(f"{path} belongs below {home}: add --records {home}.")
     typed = all(path.is_relative_to(records) for path in found)
     return (found, records) if typed else (absolute, folder)
 

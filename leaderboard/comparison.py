@@ -49,7 +49,7 @@ def compare(
         policy: Name of the policy, such as "discrete_diffusion", "flow-base" or "module:Class".
         records: Folder of the records. Those of other methods are not read.
         workers: Number of runs at once, each a process with one thread; all cores if None.
-        device: Device on which policies are computed, for example "cpu" or "cuda".
+        device: Device that runs the policies, for example "cpu" or "cuda".
 
     Returns:
         One row for each method, by division, the best first. The columns are those of `clbench.load_board`,

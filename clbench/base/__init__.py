@@ -1,1 +1,1 @@
-"""The ground floor: files, seeds, names and errors. Nothing here imports another part of clbench."""
+"""The lowest layer: files, seeds, names and errors. Nothing here imports another part of clbench."""

@@ -178,7 +178,7 @@ def pretrain(
     Args:
         scenario: Gymnasium id of the scenario.
         policy: flow, discrete_diffusion, or a class of your own as module:Class.
-        policy_size: small, base (5 million parameters) or large (40 million) for the built-in ones.
+        policy_size: small, base (5 million parameters) or large (40 million), for built-in policies.
         seed: Seed of the policy.
         ship: Copy the policy to clbench/pretrained/, so that it ships with the package. Needs a checkout.
     """

@@ -70,7 +70,7 @@ def film(
         size: Width of each picture in pixels.
         fps: Steps shown per second, at most 50 (default: the speed of the world).
         checkpoints: Folder below which `clbench run` kept policies.
-        device: Device on which the policies were computed, and are computed now.
+        device: Device that ran the policies, and runs them now.
         changes: Hyper-parameters that differ from those tuned for the scenario or, without tuning, from the
             method's defaults, as --set.name value.
     """

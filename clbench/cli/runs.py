@@ -90,7 +90,7 @@ def run(
         ray: Do the runs on a Ray cluster: its address, auto for a cluster on this machine, or local to start
             one.
         records: Folder of the records.
-        device: Device on which policies are computed, for example cpu or cuda.
+        device: Device that runs the policies, for example cpu or cuda.
         changes: Hyper-parameters to change, as --set.name value. All others keep the values tuned for the
             scenario or, without tuning, the method's defaults. Such a run gets a separate record, which the
             leaderboard does not show.
@@ -143,7 +143,7 @@ def score(
     stage: Annotated[int, whole_number(0)],
     method: str,
     seed: Seed = 0,
-    execute: Annotated[int | None, whole_number(1)] = None,
+    executed: Annotated[int | None, whole_number(1)] = None,
     data: str | None = None,
     steps: Annotated[int | None, whole_number(0)] = None,
     timeout: Annotated[int, whole_number(1)] = 300,
@@ -162,7 +162,7 @@ def score(
         stage: Stage after which the policy is evaluated.
         method: Name of the row on the leaderboard, for example me/lora.
         seed: Seed of the run. It chooses the initial states, the same for all methods.
-        execute: Actions of each chunk that are executed before the policy acts again (default: all). The
+        executed: Actions of each chunk that are executed before the policy acts again (default: all). The
             number is the same in all stages.
         data: What the policy was trained on in this stage, in words. The record keeps it.
         steps: Optimiser steps of the stage. The record keeps them.
@@ -187,7 +187,7 @@ def score(
         "stage": stage,
         "method": method,
         "seed": seed,
-        "executed": execute,
+        "executed": executed,
         "data": data,
         "steps": steps,
         "restart": restart,

@@ -77,7 +77,7 @@ def tune(
         targets: Number of targets to learn, from the first, with --values (default: all). The
             records of such runs go to a separate folder, for example targets-1 below --records.
         workers: Number of runs at once, each a process with one thread (default: all cores).
-        device: Device on which policies are computed, for example cpu or cuda.
+        device: Device that runs the policies, for example cpu or cuda.
         records: Folder of the records.
         write: File for the chosen settings; it keeps the settings of other methods. For built-in methods,
             `clbench run` reads methods/tuned/. Cannot be used with --values.

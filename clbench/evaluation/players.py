@@ -325,7 +325,7 @@ class _ChunkPlayer:
         known = self.executed
         if length < (known or 1) or (self.whole and known not in (None, length)):
             wanted = "any number of" if known is None else f"{'' if self.whole else 'at least '}{known}"
-            hint = f" as before; --execute {known} executes the first {known} of more" if self.whole else ""
+            hint = f" as before; --executed {known} executes the first {known} of more" if self.whole else ""
             raise InputError(
                 f"The policy's actions have the shape {np.shape(chunks)}, not ({LANES}, H, A): for each "
                 f"episode {wanted} actions{hint if known else ''}."

@@ -185,7 +185,7 @@ def _check_owner(scenario: Scenario, task: Task, found: str, path: Path) -> None
     how = f'expert="{expert_of(found)}"'
     if named is None:
         raise InputError(
-            f"{path} fits the task {task.name} of {scenario.id}, but results of this task stand for the "
+            f"{path} fits the task {task.name} of {scenario.id}, but results of this task belong to the "
             f"demonstrations of its expert. Give a task of your own scenario {how} to learn from this file."
         )
     raise InputError(

@@ -198,7 +198,7 @@ def run(
         perturb: Whether the skills and each new target are also evaluated in perturbed worlds.
         records: Folder of the records.
         workers: Number of runs at once, each a process with one thread; all cores if None.
-        device: Device on which policies are computed, for example "cpu" or "cuda".
+        device: Device that runs the policies, for example "cpu" or "cuda".
 
     Raises:
         UnknownNameError: There is no such scenario, method or hyper-parameter.

@@ -180,7 +180,7 @@ def steps_to_criterion(rates: Rates) -> Array:
     missing="The scenario has no criterion.",
 )
 def criterion_met(rates: Rates) -> Array:
-    """Share of the targets that were learned: the others count in all metrics as they are."""
+    """Share of the targets whose stage met the criterion; all targets count in the other metrics."""
     return average(rates.met)
 
 
@@ -343,7 +343,7 @@ def zero_shot(rates: Rates) -> Array:
     "parameters.",
 )
 def update_sparsity(rates: Rates) -> Array:
-    """Share of the parameters that have hardly changed from pretraining to after the last target."""
+    """Share of the parameters that hardly changed between the pretrained policy and the final one."""
     return _at_the_end(rates.update_sparsity)
 
 
@@ -357,7 +357,7 @@ def update_sparsity(rates: Rates) -> Array:
     missing="It was not measured after the last target.",
 )
 def activation_drift(rates: Rates) -> Array:
-    """Distance of the hidden states after the last target from where pretraining left them."""
+    """Distance between the hidden states after the last target and those of the pretrained policy."""
     return _at_the_end(rates.activation_drift)
 
 

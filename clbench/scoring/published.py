@@ -185,7 +185,7 @@ def backward_transfer_diaz_rodriguez(rates: Rates) -> Array:
     units=f"1 less a {DIFFERENCE}",
 )
 def remembering_diaz_rodriguez(rates: Rates) -> Array:
-    """1 less the size of the negative part of backward transfer."""
+    """1 minus the size of the negative part of backward transfer."""
     return 1 - np.abs(np.minimum(_backward_transfer(rates), 0))
 
 
@@ -292,7 +292,7 @@ def _isolated(rates: Rates) -> Array:
     missing="There are no targets, stages end at a criterion, or a point of a learning curve is missing.",
 )
 def forward_transfer_libero(rates: Rates) -> Array:
-    """Success on the target while it is learned, compared with nothing.
+    """Success on the target while it is learned, without a baseline.
 
     LIBERO's points are equally spaced, ours are the scenario's. LIBERO continues from the best checkpoint of
     a stage, chosen on the same episodes that it reports, and holds the curve there; here a stage ends with
@@ -362,7 +362,7 @@ def negative_backward_transfer_arfm(rates: Rates) -> Array:
     missing="There are no targets, stages end at a criterion, or a success while or after it is missing.",
 )
 def area_under_curve_libero(rates: Rates) -> Array:
-    """Success on a target from when it is learned to the end, compared with nothing.
+    """Success on a target from its stage to the end, without a baseline.
 
     The points and the checkpoint differ from LIBERO's as in `forward_transfer_libero`.
     """

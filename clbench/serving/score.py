@@ -122,15 +122,15 @@ def score(
     server = _kept_metadata(getattr(policy, "metadata", {}))
     if server and server == record.diagnostics.get(str(stage - 1), {}).get("server"):
         LOG.warning(
-            "The server says the same about itself as in stage %d (%s): does it have the new checkpoint?",
+            "The server sends the same metadata as in stage %d (%s): does it serve the new checkpoint?",
             stage - 1,
             described(server),
         )
     same = _seeds_of(server, run, stage) if server and stage else []
     if same:
         LOG.warning(
-            "The server says the same about itself as with seed %s in this stage (%s): fine-tune once for "
-            "each seed. Seeds of one checkpoint differ in initial states alone.",
+            "The server sends the same metadata as with seed %s in this stage (%s): fine-tune once for "
+            "each seed. Seeds of one checkpoint differ only in their initial states.",
             ", ".join(map(str, same)),
             described(server),
         )

@@ -110,7 +110,7 @@ def _beside_rows(runs: list[Run]) -> Sifted:
     with_row = {(run.table, run.method) for run in runs if not run.order}
     kept = [run for run in runs if (run.table, run.method) in with_row]
     alone = [run for run in runs if (run.table, run.method) not in with_row]
-    reason = "its method has no run with the targets in the published order, of which rows are made."
+    reason = "its method has no run with the targets in the published order, which a row needs."
     return kept, [no_row(run.path, reason) for run in alone]
 
 

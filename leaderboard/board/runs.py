@@ -193,7 +193,7 @@ def _declared(scenario: str, method: str) -> tuple[dict[str, Any], dict[str, Any
 def _check_kind(run: RunInfo, changed: bool | None) -> None:
     """Refuse a tuning run, or one with changed settings where none are expected, or the reverse."""
     if run.split == "validation":
-        raise RecordError("it is a tuning run: its episodes may be chosen on.")
+        raise RecordError("it is a tuning run: settings may have been chosen on its episodes.")
     if run.trained_elsewhere and run.seed >= FIRST_TUNING_SEED:
         raise RecordError(
             f"seeds from {FIRST_TUNING_SEED} are for tuning: settings may be chosen on its episodes."
@@ -201,7 +201,7 @@ def _check_kind(run: RunInfo, changed: bool | None) -> None:
     if changed is False and run.changes:
         raise RecordError(f"settings were changed: {', '.join(run.changes)}.")
     if changed is True and not run.changes:
-        raise RecordError("no setting was changed: its place is among the records of the board.")
+        raise RecordError("no setting was changed: it belongs in the records of the board.")
 
 
 def division_of(uses: dict[str, Any]) -> str:

@@ -89,8 +89,8 @@ def _definitions(boards: Mapping[str, list[Row]]) -> Iterator[str]:
             yield f"On {name}, Kendall's tau between the final average and other definitions is: {listed}."
     if any(found.values()):
         yield (
-            "Definitions count the same episodes, so that even equal methods would be ordered alike by them: "
-            "these figures describe the board, and test nothing."
+            "All definitions count the same episodes, so they would order even equal methods alike: "
+            "these figures describe the board, and are not a test."
         )
 
 

@@ -20,7 +20,7 @@ from ..views.format import MISSING, format_interval
 from ..views.markdown import templates
 
 INTRODUCTION = (
-    "How the claims of the papers fare here, with a policy of less than a million parameters. Generated "
+    "This page judges claims of papers with a policy of less than a million parameters. Generated "
     "by `clbench claims` from the records alone; each verdict follows from a rule. The rules were written "
     "before the records of these boards, but some changed later: the list says how many, each rule says "
     "when, and docs/history.md says why. On 2026-11-26, changed rules turned 15 of 41 verdicts without a "
@@ -78,7 +78,7 @@ def _corrected(here: Sequence[Judged]) -> str:
     if began is None:
         return ""
     later = sum(1 for one in here if one.claim.settled > began)
-    first = f"The first record that is used here is of {began:%Y-%m-%d}"
+    first = f"The first record used here dates from {began:%Y-%m-%d}"
     return f"{first}; {later or 'none'} of the {counted(len(here), 'rule')} changed after it."
 
 

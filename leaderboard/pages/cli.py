@@ -37,7 +37,8 @@ def claims(
     Args:
         records: Folder of the records of the leaderboard.
         controls: Folder of the records of changed settings.
-        scenario: Gymnasium id of the scenario on which all claims are judged (default: each names its own).
+        scenario: Gymnasium id of the scenario on which all claims are judged (default: each claim
+            names its own).
         output: Path of the page.
     """
     from ..claims.judges import judge_all

@@ -62,8 +62,8 @@ def _gain_of_a_rate(first: Rung, best: Rung, rates: int, evidence: Evidence) -> 
     gain = evidence.difference("kept", *(rung(BASELINE, one.factor) for one in (best, first))).estimate
     certain = "" if gain.is_above(0) else ", which is not certain"
     return (
-        f"The difference, seed by seed, is {format_interval(gain)}{certain}; it flatters this rate, the best "
-        f"of {rates} in the episodes that measure it"
+        f"The difference, seed by seed, is {format_interval(gain)}{certain}; it is biased upwards, because "
+        f"this rate was chosen as the best of {rates} on the same episodes"
     )
 
 

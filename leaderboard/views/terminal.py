@@ -123,7 +123,7 @@ def _fitted(
             break
         dropped += [head.title for head in kept if head.title == name]
         kept = [head for head in kept if head.title != name]
-    line = f"Too wide for {width} columns: {', '.join(dropped)}. The page and --json have all."
+    line = f"Too wide for {width} columns: {', '.join(dropped)}. The page and --json show every column."
     return [_table(title, rows, kept), *([Text(line, style="italic")] if dropped else [])]
 
 

@@ -101,7 +101,7 @@ def test_a_plane_shows_every_method_in_the_colours_of_the_theme(four_methods: Pa
     )
     for text in ("clbench/Toy-v0", "sft", "replay", "asks", "from_scratch"):
         assert f">{text}</text>" in light
-    assert "Thin lines: 95 % intervals, as far as they fit." in light
+    assert "Thin lines: 95 % intervals, cut off at the edge." in light
     assert "var(--" not in light + dark
     assert light != dark
     assert plot.plane(str(four_methods)).svg() == light  # the scenario with most rows

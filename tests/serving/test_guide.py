@@ -63,7 +63,7 @@ def test_the_policy_of_the_page_is_served_and_scored_by_its_commands(
             )
             assert f"stage {stage}: left 0.00" in done.stderr, done.stderr
             assert "(server: checkpoint stage-0)" in done.stderr
-    assert "does it have the new checkpoint?" in done.stderr
+    assert "does it serve the new checkpoint?" in done.stderr
     (kept,) = (path for path in (tmp_path / "leaderboard" / "records").rglob("*") if path.is_file())
     assert kept.name == "seed-0.json.unfinished"
 

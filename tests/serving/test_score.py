@@ -324,12 +324,12 @@ def test_chunks_of_another_length_are_refused_unless_the_number_executed_is_give
 ) -> None:
     lengths = iter([4, 6])
     with pytest.raises(
-        InputError, match=r"\(40, 6, 2\), not \(40, H, A\): .* 4 actions as before; --execute 4"
+        InputError, match=r"\(40, 6, 2\), not \(40, H, A\): .* 4 actions as before; --executed 4"
     ):
         run(lambda shown: knowing(0, next(lengths))(shown), 0)
     run(knowing(0, 4), 0)
     with pytest.raises(
-        InputError, match=r"\(40, 6, 2\), not \(40, H, A\): .* 4 actions as before; --execute 4"
+        InputError, match=r"\(40, 6, 2\), not \(40, H, A\): .* 4 actions as before; --executed 4"
     ):
         run(knowing(1, 6), 1)
     with pytest.raises(InputError, match=r"settings of .* are \{'executed': 6\}, but were \{'executed': 4\}"):
@@ -375,7 +375,7 @@ def test_a_server_that_says_the_same_as_in_the_stage_before_is_suspected(
         assert not caplog.messages
         run(Describing(stage, {"checkpoint": checkpoint}), stage)
     assert caplog.messages == [
-        "The server says the same about itself as in stage 1 (checkpoint b): does it have the new checkpoint?"
+        "The server sends the same metadata as in stage 1 (checkpoint b): does it serve the new checkpoint?"
     ]
 
 
@@ -398,7 +398,7 @@ def test_a_checkpoint_that_was_scored_with_another_seed_is_no_second_training(
             run(Describing(stage, {"checkpoint": checkpoint}), stage, seed=seed)
     (message,) = caplog.messages
     assert message.startswith(
-        "The server says the same about itself as with seed 1 in this stage (checkpoint d)"
+        "The server sends the same metadata as with seed 1 in this stage (checkpoint d)"
     )
 
 

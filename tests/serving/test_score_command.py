@@ -31,10 +31,10 @@ def test_the_command_scores_stage_after_stage_and_skips_what_is_done(
     assert f"Next: clbench leaderboard --records {records}" in shown
     command(ID, **options)  # nobody serves the policy any more
     assert capsys.readouterr().err == "Stage 2 of me/elsewhere, seed 0, is done.\n"
-    command(ID, **options, data="by hand", execute=3)
+    command(ID, **options, data="by hand", executed=3)
     assert "is done" in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):
-        command(ID, **options, execute=1)
+        command(ID, **options, executed=1)
     assert "with executed 3, not 1. Its record is finished, and never edited." in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):
         command(ID, **options, restart=True)
@@ -50,15 +50,15 @@ def test_the_command_refuses_what_contradicts_a_done_stage_and_scores_it_again_i
     with serving(tmp_path, 0) as (address, _):
         options = {"policy": address, "stage": 0, "method": "me/elsewhere", "records": records}
         command(ID, **options, data="by hand", steps=5)
-        command(ID, **options, data="by hand", steps=5, execute=3)
-        for name, value, other in (("data", "by hand", "mine"), ("steps", 5, 9), ("execute", 3, 2)):
+        command(ID, **options, data="by hand", steps=5, executed=3)
+        for name, value, other in (("data", "by hand", "mine"), ("steps", 5, 9), ("executed", 3, 2)):
             with pytest.raises(SystemExit, match="2"):
                 command(ID, **options, **{name: other})
             shown = capsys.readouterr().err
             assert f" {value!r}, not {other!r}. Score it again with --restart" in shown
-        command(ID, **options, execute=2, restart=True)
+        command(ID, **options, executed=2, restart=True)
     capsys.readouterr()
-    command(ID, **options, execute=2)
+    command(ID, **options, executed=2)
     assert "is done" in capsys.readouterr().err
 
 

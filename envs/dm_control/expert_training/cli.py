@@ -33,7 +33,7 @@ def train(
     Args:
         task: Name of the task, such as cartpole_left.
         seed: Seed of all random draws.
-        steps: Number of decisions to train for; the number of the included expert if not given.
+        steps: Number of decisions to train for (default: as many as the included expert).
         output: Folder of the expert; the task reads the default, a folder inside clbench.
         log: File that receives one line for each segment of the training.
     """

@@ -90,7 +90,7 @@ def test_the_ladder_tells_what_a_smaller_learning_rate_does(
     assert "plain fine-tuning keeps 0.20" in page()
     assert "at the scenario's learning rate, and 0.50" in page()
     assert "The difference, seed by seed, is 0.30 [" in page()
-    assert "which is not certain; it flatters" not in page()
+    assert "which is not certain; it is biased" not in page()
 
 
 def test_a_smaller_learning_rate_that_keeps_more_by_chance_is_not_called_certain(
@@ -103,7 +103,8 @@ def test_a_smaller_learning_rate_that_keeps_more_by_chance_is_not_called_certain
     found = re.search(r"The difference, seed by seed, is 0\.10 \[-0\.\d+, 0\.\d+\](.*)", page())
     assert found
     assert found[1] == (
-        ", which is not certain; it flatters this rate, the best of 2 in the episodes that measure it."
+        ", which is not certain; it is biased upwards, because this rate was chosen as the best of 2 on the "
+        "same episodes."
     )
 
 
@@ -220,7 +221,7 @@ def test_definitions_that_order_the_methods_alike_have_a_tau_of_one(
     text = page()
     assert "On clbench/Even-v1, Kendall's tau between the final average and other definitions is: " in text
     assert "forgetting 1.00" in text
-    assert "these figures describe the board, and test nothing." in text
+    assert "these figures describe the board, and are not a test." in text
     alike = (
         "the 4 seeds agree on the order of the 6 methods more than chance would explain (Kendall's W 1.00, "
         "p = 0.0012)."

@@ -389,7 +389,7 @@ def test_a_record_elsewhere_is_refused_with_the_option_that_finds_it(
         command(beside, tier="recomputed", scenario=TOY, workers=1)
     assert stopped.value.code == 2
     assert f"{mine} is not below " in (error := capsys.readouterr().err)
-    assert "name its folder of records, in which it is SCENARIO/METHOD/seed-N.json, with --records" in error
+    assert "give --records the folder in which it is SCENARIO/METHOD/seed-N.json" in error
     command(beside, tier="recomputed", scenario=TOY, records=Path("records"), workers=1)
     assert f"{beside}: recomputed" in capsys.readouterr().out
 
@@ -425,7 +425,7 @@ def test_the_command_prints_json_of_good_and_bad_records(
         ({"checkpoints": Path("nowhere")}, "There is no folder nowhere. --checkpoints names the folder"),
         ({"paths": ["nowhere.json"]}, "There is no record at nowhere.json"),
         ({"paths": []}, "There is no record to verify"),
-        ({"records": Path("elsewhere/records")}, "elsewhere/records: name its folder of records"),
+        ({"records": Path("elsewhere/records")}, "elsewhere/records: give --records the folder"),
     ],
 )
 def test_a_wrong_word_on_the_command_line_is_named(

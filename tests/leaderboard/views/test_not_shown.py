@@ -102,7 +102,10 @@ def lose_validation_episode(record: Record) -> None:
         (lose_curve_episode, "the test episode 9 of skill_0 (and 3 others) is missing at stage 1, step 100"),
         (lose_validation_episode, "the validation episode 9 of target_0 is missing at stage 1"),
         (set_in("policy", "step", []), "the columns of policy have different lengths"),
-        (set_in("run", "split", "validation"), "it is a tuning run: its episodes may be chosen on."),
+        (
+            set_in("run", "split", "validation"),
+            "it is a tuning run: settings may have been chosen on its episodes.",
+        ),
         (set_in("run", "split", "all"), "split must be test or validation"),
         (set_in("run", "settings", {"strength": 2}), "settings do not match most seeds: strength"),
         (set_in("run", "device", "cuda"), "settings do not match most seeds: device"),

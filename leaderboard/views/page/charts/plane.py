@@ -27,7 +27,7 @@ NARROW = Size(205, 320, 2)
 LETTER = 6
 """Mean width of a letter in pixels."""
 
-MEANING = "Thin lines: 95 % intervals, as far as they fit. Dashed lines: Pareto front of a division."
+MEANING = "Thin lines: 95 % intervals, cut off at the edge. Dashed lines: Pareto front of a division."
 """What the marks do not say themselves."""
 
 
