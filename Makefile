@@ -177,7 +177,7 @@ check: .venv/installed-dev
 # .venv but not the checkout: to install PyTorch a second time took 90 s.
 WALKS := tests/cli tests/test_readme.py tests/test_submission.py tests/test_your_scenario.py tests/runs/test_agents_guide.py \
 	tests/serving/test_guide.py
-WHEEL_TESTS := $(WALKS) tests/test_package.py \
+WHEEL_TESTS := $(addprefix tests/cli/test_,entry.py main.py scaffold.py) tests/test_readme.py tests/test_package.py \
 	$(addprefix tests/leaderboard/,views/page/test_html.py views/test_markdown.py submission/test_submit.py) \
 	tests/leaderboard/claims/test_claims.py tests/leaderboard/pages \
 	tests/methods/test_methods.py::test_the_link_of_a_method_is_the_first_paper_that_its_module_names

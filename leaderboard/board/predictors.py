@@ -95,15 +95,15 @@ def prediction_of(name: str, values: Array, replicates: int = REPLICATES) -> Pre
     draws = np.random.default_rng(0).integers(seeds, size=(replicates, seeds))
     drawn = values[:, draws].mean(axis=2)  # (rows, replicates, 2)
     low, high = np.nanpercentile(kendall_tau(drawn[..., 0].T, drawn[..., 1].T), (2.5, 97.5))
-    return Prediction(tau, float(low), float(high), seeds, rows, chance_of(tau, values), name)
+    return Prediction(tau, float(low), float(high), seeds, rows, chance_among_equals(tau, values), name)
 
 
-def chance_of(tau: float, values: Array, boards: int = BOARDS) -> float:
+def chance_among_equals(tau: float, values: Array, boards: int = BOARDS) -> float:
     """Return the probability of a tau as large as this, of either sign, if all methods were equal.
 
-    Both quantities come from the same runs, so that their noise correlates: Kendall's own test takes equal
-    methods for different ones. Here the noise of each row, what is left without the means of rows and seeds,
-    is drawn anew by seed with replacement, for both quantities together.
+    Both quantities come from the same runs, so their noise correlates, and Kendall's own test finds an order
+    among equal methods. Here the noise of a row is its residual after the means of rows and seeds. It is
+    resampled by seed with replacement, for both quantities together.
 
     Args:
         tau: Kendall's tau of the board.
@@ -113,8 +113,7 @@ def chance_of(tau: float, values: Array, boards: int = BOARDS) -> float:
     rows, seeds, _ = values.shape
     noise = values - values.mean(axis=1, keepdims=True)
     noise -= noise.mean(axis=0, keepdims=True)
-    generator = np.random.default_rng(0)
-    draws = generator.integers(seeds, size=(boards, rows, seeds))
+    draws = np.random.default_rng(0).integers(seeds, size=(boards, rows, seeds))
     means = noise[np.arange(rows)[:, None], draws].mean(axis=2)  # (boards, rows, 2)
     taus = kendall_tau(means[..., 0], means[..., 1])
     taus = taus[np.isfinite(taus)]

@@ -54,7 +54,7 @@ def _afterwards(evidence: Evidence, arm: str) -> str:
 
 
 def rises_above(bar: float, counting: Iterable[Figure], every: Iterable[Figure]) -> Verdict:
-    """Return whether a figure is above a bar: for one of the arms that count, or for none of all arms."""
+    """Return the verdict of a bar: an arm that counts must certainly be above it, or all arms below it."""
     return decided(holds=any(one.low > bar for one in counting), fails=all(one.high < bar for one in every))
 
 

@@ -8,7 +8,7 @@ from scipy.stats import kendalltau
 
 from clbench.base.entry_points import resolve
 
-chance_of = resolve("clbench.leaderboard.board.predictors:chance_of")
+chance_among_equals = resolve("clbench.leaderboard.board.predictors:chance_among_equals")
 prediction_of = resolve("clbench.leaderboard.board.predictors:prediction_of")
 predictions = resolve("clbench.leaderboard.board.predictors:predictions")
 
@@ -40,7 +40,7 @@ def test_equal_methods_with_noise_that_correlates_seldom_seem_to_be_ordered() ->
         means = values.mean(axis=1)
         test = kendalltau(means[:, 0], means[:, 1])
         kendalls += test.pvalue < 0.05
-        ours += chance_of(test.statistic, values, boards=200) < 0.05
+        ours += chance_among_equals(test.statistic, values, boards=200) < 0.05
     assert ours <= 12 < kendalls  # 5 are expected; Kendall's test takes the two quantities for unrelated
 
 
@@ -62,9 +62,14 @@ def test_the_probability_of_a_tau_is_that_of_equal_methods_with_the_noise_of_the
             for one in (0, 1)  # rounded: a row whose seeds are drawn once each has a mean of 0, a tie
         ]
         taus.append(kendalltau(*means).statistic)
-    assert chance_of(1.0, values, boards=300) == (1 + sum(abs(tau) > 1 - 1e-9 for tau in taus)) / 301
-    assert chance_of(-0.6, values, boards=300) == (1 + sum(abs(tau) > 0.6 - 1e-9 for tau in taus)) / 301
-    assert chance_of(0.0, values, boards=300) == 1.0
+    assert (
+        chance_among_equals(1.0, values, boards=300) == (1 + sum(abs(tau) > 1 - 1e-9 for tau in taus)) / 301
+    )
+    assert (
+        chance_among_equals(-0.6, values, boards=300)
+        == (1 + sum(abs(tau) > 0.6 - 1e-9 for tau in taus)) / 301
+    )
+    assert chance_among_equals(0.0, values, boards=300) == 1.0
 
 
 def test_a_predictor_that_is_equal_everywhere_predicts_nothing() -> None:

@@ -93,7 +93,7 @@ def test_the_page_says_how_many_rules_changed_after_the_first_record_that_they_j
     bench.add("frozen", edit=started("2026-11-26T12:00:00+00:00"))
     later = [one for one in CLAIMS.values() if one.settled > datetime(2026, 11, 25, 12, tzinfo=UTC)]
     assert 0 < len(later) < len(IDS)
-    text = f"is of 2026-11-25; {len(later)} of the {len(IDS)} rules changed after it."
+    text = f"dates from 2026-11-25; {len(later)} of the {len(IDS)} rules changed after it."
     assert text in bench.page()
 
 
@@ -101,7 +101,7 @@ def test_the_page_says_how_many_rules_changed_after_the_first_record_that_they_j
 def test_a_record_may_say_anything_about_its_start(bench: Bench, text: object) -> None:
     bench.add("sft", edit=started(text))
     known = text == "2999-01-01"
-    assert (f"is of 2999-01-01; none of the {len(IDS)} rules changed after it." in bench.page()) == known
+    assert (f"dates from 2999-01-01; none of the {len(IDS)} rules changed after it." in bench.page()) == known
 
 
 def test_a_rule_that_says_something_new_gets_the_time_of_its_change() -> None:
