@@ -123,6 +123,31 @@ def test_an_adapter_adds_the_papers_matrix(variant: str) -> None:
     assert np.abs(expected - under).max() > 1e-3
 
 
+@pytest.mark.parametrize("rank", [4, 16, 64])
+def test_each_adapter_has_the_rank_that_is_asked_for(rank: int) -> None:
+    policy = TransformerPolicy(SMALL)
+    maps = {name: module for name, module in policy.named_modules() if isinstance(module, nn.Linear)}
+    build_method("lora", {"rank": rank}).prepare(policy, Prior({}))
+    found = {name: tuple(weight.shape) for name, weight in _adapters(policy).items()}
+    expected = {}
+    for name, module in maps.items():
+        if "layers" in name.split("."):
+            expected[f"{name}.lora_A.default.weight"] = (rank, module.in_features)
+            expected[f"{name}.lora_B.default.weight"] = (module.out_features, rank)
+    assert found == expected
+
+
+@VARIANTS
+def test_the_second_target_goes_on_with_the_adapters_of_the_first(variant: str) -> None:
+    method, policy = _adapted(variant)
+    batch = toy_source("right", seed=1).sample(8)
+    before, actions = _weights(policy), policy.act(batch.state, batch.words, batch.noise)
+    method.start_task(policy, Stage(2, TOY.task("down"), 1, 8, toy_source("down"), Prior({})))
+    assert policy.act(batch.state, batch.words, batch.noise).equal(actions)
+    assert _weights(policy).keys() == before.keys()
+    assert all(weight.equal(before[name]) for name, weight in _weights(policy).items())
+
+
 def _map(policy: Policy) -> NDArray[np.float64]:
     """Return the matrix of a linear map with its adapter, from the images of unit vectors."""
     module: Any = policy.get_submodule(MAP)
@@ -154,6 +179,15 @@ def test_the_learning_rate_of_the_adapters_is_a_multiple_of_the_scheduled_one() 
     assert method.learning_rate(0.01, Progress(3, 10)) == pytest.approx(0.025)
 
 
+def test_the_step_factor_and_the_speed_each_multiply_the_learning_rate_once() -> None:
+    method, policy = build_method("lora", {"speed": 2.5, "step_factor": 0.1}), TransformerPolicy(SMALL)
+    method.prepare(policy, Prior({}))
+    rates: list[float | None] = []
+    stage = Stage(1, TOY.task("right"), 0, 1, toy_source("right"), Prior({}))  # one step, at the peak
+    adapt(policy, method, stage, Budget(learning_rate=1e-3), lambda step: rates.append(step.learning_rate))
+    assert rates == pytest.approx([2.5e-4])
+
+
 class _Flat(nn.Module):
     """A policy of a stranger, as far as adapters look at it."""
 
@@ -166,6 +200,21 @@ def test_a_policy_without_layers_is_refused_with_what_to_do() -> None:
     method: Any = build_method("lora", {})
     with pytest.raises(InputError, match=r"called `layers`; _Flat has none\. Rename one, or leave lora out"):
         method.prepare(_Flat(), Prior({}))
+
+
+class _Sublayers(TransformerPolicy):
+    """A policy with a linear map in a module whose name only contains the word `layers`."""
+
+    def __init__(self) -> None:
+        super().__init__(SMALL)
+        self.sublayers = nn.ModuleList([nn.Linear(8, 8)])
+
+
+def test_a_module_whose_name_only_contains_the_word_layers_has_no_adapter() -> None:
+    policy = _Sublayers()
+    build_method("lora", {}).prepare(policy, Prior({}))
+    adapted = {name.partition(".")[0] for name in _adapters(policy)}
+    assert adapted == {"backbone", "head"}
 
 
 class _Fused(TransformerPolicy):

@@ -86,6 +86,18 @@ def test_seeds_give_the_mean_of_their_values_and_an_interval() -> None:
     assert from_matrix(TRIANGLE)["performance_continual_world"].low is None
 
 
+def test_the_interval_of_a_difference_is_that_of_a_rate_stretched_to_its_own_bounds() -> None:
+    # two seeds: the first target falls from 1 to 0.6 and to 0.2, so that (change + 1) / 2 is 0.3 and 0.1
+    change = from_matrix([[[1.0, 0.0], [0.6, 1.0]], [[1.0, 0.0], [0.2, 1.0]]])["backward_transfer"]
+    rate = from_matrix([[[0.3]], [[0.1]]])["final_average"]
+    assert change.value == pytest.approx(-0.6)
+    assert rate.low is not None
+    assert rate.high is not None
+    assert 0 < rate.low < 0.2 < rate.high < 1
+    assert change.low == pytest.approx(2 * rate.low - 1)
+    assert change.high == pytest.approx(2 * rate.high - 1)
+
+
 def test_per_cent_are_recognised_and_can_be_declared() -> None:
     whole = from_matrix(np.array(TRIANGLE) * 100)
     assert whole.unit == "percent"
@@ -139,6 +151,18 @@ def test_the_order_of_two_methods_flips_between_definitions_and_both_sides_are_n
     assert "negative_backward_transfer_libero" in flip.second_is_better
 
 
+def test_every_pair_of_methods_is_looked_at_for_a_flip() -> None:
+    report = from_matrix(
+        {
+            "early": [[0.8, 0.0, 0.0], [0.2, 0.8, 0.0], [0.4, 0.6, 0.8]],
+            "best": [[0.8, 0.0, 0.0], [0.8, 0.8, 0.0], [0.8, 0.8, 0.8]],
+            "late": [[0.8, 0.0, 0.0], [0.8, 0.8, 0.0], [0.3, 0.6, 0.8]],
+        }
+    )
+    pairs = [(flip.first, flip.second) for flip in report.flips if flip.family == "forgetting"]
+    assert pairs == [("early", "late")]
+
+
 def test_the_gain_counts_in_no_flip_since_it_repeats_the_final_average() -> None:
     keeps, learns = [[1.0, 0.0], [0.9, 0.5]], [[1.0, 0.0], [0.1, 0.9]]
     report = from_matrix({"keeps": keeps, "sft": learns}, retained="task 1")
@@ -171,6 +195,24 @@ def test_three_tenths_of_rates_up_to_1_leave_the_unit_in_doubt_and_fewer_do_not(
             from_matrix(matrix)
     else:
         assert from_matrix(matrix).unit == "percent"
+
+
+@pytest.mark.parametrize("rate", [0.5, 1.0])
+def test_exactly_a_quarter_of_rates_up_to_1_leaves_the_unit_in_doubt(rate: float) -> None:
+    with pytest.raises(InputError, match="found 80, and other rates are at most 1"):
+        from_matrix([[rate, 40.0], [60.0, 80.0]])
+
+
+def test_a_single_low_rate_of_a_task_in_a_table_of_per_cent_is_no_share() -> None:
+    assert from_matrix([[41.5, 0.0, 0.0], [13.9, 24.5, 0.0], [4.8, 11.0, 0.8]]).unit == "percent"
+
+
+def test_shares_of_one_method_beside_many_in_per_cent_are_noticed() -> None:
+    percent = np.array([[80.0, 0.0], [50.0, 90.0]])
+    methods = {f"method {number}": percent for number in range(4)}
+    assert from_matrix(methods).unit == "percent"
+    with pytest.raises(InputError, match="and other rates are at most 1: is it a share"):
+        from_matrix({**methods, "wrong": percent / 100})
 
 
 def test_shares_of_one_seed_or_of_one_task_in_a_table_of_per_cent_are_noticed() -> None:
@@ -228,6 +270,13 @@ def test_a_reason_names_the_missing_cells_of_a_reference() -> None:
     assert report.of("gain", "sft").reason == "The table lacks stage 3, task 1."
 
 
+def test_a_reason_counts_no_cells_of_a_seed_that_only_the_reference_has() -> None:
+    holed = np.array(JOINT)
+    holed[3, 0] = np.nan
+    report = _report({"mine": [MATRIX, MATRIX], "sft": np.array([JOINT, holed, holed])})
+    assert report.of("gain", "mine").reason == "The table lacks method sft, seed '1', stage 3, task 1."
+
+
 def test_without_retained_skills_no_reason_says_that_a_success_on_one_is_missing() -> None:
     report = from_matrix([[0.5]])
     for name in ("retention", "kept_skills_over_stages"):
@@ -264,6 +313,7 @@ def test_a_table_of_pandas_has_a_row_for_every_metric_and_method() -> None:
     row = frame[(frame.metric == "forgetting_avalanche") & (frame.method == "other")].iloc[0]
     assert (row.family, row.source) == ("forgetting", METRICS["forgetting_avalanche"].source)
     assert row.value == pytest.approx(0.4)
+    assert set(frame[frame.family.notna()].metric) == set(DEFINITIONS)
     runs: list[Any] = [TRIANGLE, np.array(TRIANGLE) - 0.2]
     seeds = from_matrix(runs).frame().set_index("metric").loc["adaptation"]
     assert seeds.low < seeds.value < seeds.high

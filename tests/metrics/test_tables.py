@@ -66,6 +66,16 @@ def test_a_gain_compares_equal_seeds_whatever_their_order_in_the_table(table: Pa
     assert from_csv(table).of("gain", "mine").reason == "Method sft has no seed '1'."
 
 
+def test_the_groups_and_the_unit_that_are_named_hold_for_a_table(table: Path) -> None:
+    text = "stage,known,second,first,never\n1,0.9,0.1,0.8,0.3\n2,0.7,0.6,0.4,0.2\n"
+    table.write_text(text, encoding="utf-8")
+    targets = ["first", "second"]
+    report = from_csv(table, retained="known", target=targets, held_out="never", unit="percent")
+    found = [report[name].value for name in ("adaptation", "retention", "zero_shot")]
+    assert found == pytest.approx([(0.008 + 0.006) / 2, 0.007, 0.002])
+    assert report.unit == "percent"
+
+
 def test_a_file_of_ones_own_comes_before_an_example_of_its_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -118,6 +128,7 @@ def test_every_example_names_its_source_and_can_be_read_by_its_name() -> None:
         ("stage,reach\n1,0,5\n", "line 2: expected 2 cells, found 3"),
         ("stage,reach\n1,half\n", "line 2, stage 1, task 'reach': expected a success rate such as 0.8 or 80"),
         ("stage,reach\n1,0.5\n1,0.6\n", "line 3: stage 1, task 'reach' was given on line 2 already"),
+        ("stage,reach\n1,0.5\n1,0.5\n", "line 3: stage 1, task 'reach' was given on line 2 already"),
         (
             "stage,reach\nfirst,0.5\n",
             "line 2: stage must be a whole number, how many targets were learned, not 'first'",

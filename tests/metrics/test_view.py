@@ -46,6 +46,25 @@ def test_the_best_method_comes_first_whichever_end_is_better() -> None:
         assert shown[place + 1] == values
 
 
+def test_a_method_without_a_value_comes_last_and_its_reason_is_listed() -> None:
+    holed = [[np.nan, 0.1], [0.6, 0.9]]
+    shown = lines(from_matrix({"holed": holed, "less": LESS, "mine": MINE}))
+    place = next(number for number, line in enumerate(shown) if line.startswith("forgetting: "))
+    assert shown[place + 1] == "mine 0.200   less 0.500   holed -"
+    reason = shown.index("The table lacks stage 1, task 1.", shown.index("No value"))
+    assert "forgetting (holed)" in shown[reason + 1].split(", ")
+
+
+def test_an_interval_is_shown_from_its_lower_to_its_upper_end() -> None:
+    report = from_matrix([MINE, LESS])
+    value = report["adaptation"]
+    assert value.low is not None
+    assert value.high is not None
+    assert value.low < 0.8 < value.high
+    ends = f"[{value.low:.3f}, {value.high:.3f}]"
+    assert f"adaptation: 0.800 {ends}, higher is better" in lines(report)
+
+
 def test_a_value_without_an_interval_beside_others_says_why() -> None:
     seeds: list[Any] = [MINE, np.array(MINE) - 0.1]
     shown = lines(from_matrix({"two": seeds, "one": MINE, "alike": [MINE, MINE]}))
@@ -82,3 +101,27 @@ def test_the_groups_of_the_tasks_are_values_for_json() -> None:
         ["task 4"],
     )
     assert (found["unit"], found["unit_was_given"], found["seeds"]) == ("share", False, {"": [""]})
+
+
+def test_the_values_for_json_have_every_method_and_flip_and_the_targets_as_learned() -> None:
+    early = [[0.8, 0.0, 0.0], [0.2, 0.8, 0.0], [0.4, 0.6, 0.8]]
+    late = [[0.8, 0.0, 0.0], [0.8, 0.8, 0.0], [0.3, 0.6, 0.8]]
+    holed = [[0.8, 0.0, 0.0], [0.8, 0.8, 0.0], [0.8, np.nan, 0.0]]
+    report = from_matrix({"early": early, "late": late, "holed": holed}, tasks=["push", "lift", "drop"])
+    found = as_values(report)
+    assert found["target"] == ["push", "lift", "drop"]
+    (adaptation,) = (one for one in found["metrics"] if one["name"] == "adaptation")
+    assert {name: value["value"] for name, value in adaptation["values"].items()} == pytest.approx(
+        {"early": 0.8, "late": 0.8, "holed": (0.8 + 0.8 + 0.0) / 3}
+    )
+    (forgetting,) = (one for one in found["metrics"] if one["name"] == "forgetting")
+    assert forgetting["values"]["holed"] == {
+        "value": None,
+        "low": None,
+        "high": None,
+        "reason": "The table lacks stage 3, lift.",
+    }
+    assert [(one["family"], one["first"], one["second"]) for one in found["flips"]] == [
+        (flip.family, flip.first, flip.second) for flip in report.flips
+    ]
+    assert len(found["flips"]) > 1

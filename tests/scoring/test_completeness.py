@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from clbench.records.reader import RecordError
-from clbench.records.record import EpisodeRow, PolicyRow, Record
+from clbench.records.record import EXTERNAL_USES, AnswerRow, EpisodeRow, PolicyRow, Record
 from clbench.scoring.scores import Scores
 
 ANSWERS = {(stage, kind): (25, 20) for stage in range(3) for kind in ("left", "above")}
@@ -36,9 +36,16 @@ def test_a_whole_record_counts(record: Record) -> None:
     assert Scores.from_record(record).asked.sum(axis=-1).tolist() == [50, 50, 50]
 
 
-def test_as_many_questions_as_the_budget_demands_must_be_asked(record: Record) -> None:
-    record.scenario.budget["test_questions"] = 60
-    refused(record, "answers: 50 questions were asked, not 60")
+def at_the_ends_alone(record: Record) -> None:
+    """Leave nothing in a record but what was measured at the ends of stages."""
+    for name in ("episodes", "answers", "policy"):
+        setattr(record, name, without(getattr(record, name), lambda row: row[1] in (0, 400)))
+
+
+@pytest.mark.parametrize("demanded", [40, 60])
+def test_as_many_questions_as_the_budget_demands_must_be_asked(record: Record, demanded: int) -> None:
+    record.scenario.budget["test_questions"] = demanded
+    refused(record, f"answers: 50 questions were asked, not {demanded}")
 
 
 def test_at_every_point_the_same_questions_must_be_asked(record: Record) -> None:
@@ -53,6 +60,28 @@ def test_only_a_policy_that_is_not_built_in_may_have_no_answers(record: Record) 
     refused(record, "answers: there are none at stage 0, step 0")
     record.run.policy = "mine:Policy"
     assert Scores.from_record(record).asked.sum() == 0
+
+
+def test_a_policy_that_is_not_built_in_and_answers_questions_is_asked_all_of_them(record: Record) -> None:
+    record.run.policy = "mine:Policy"
+    assert Scores.from_record(record).asked.sum(axis=-1).tolist() == [50, 50, 50]
+    record.scenario.budget["test_questions"] = 60
+    refused(record, "answers: 50 questions were asked, not 60")
+
+
+def test_a_policy_that_was_trained_elsewhere_has_neither_answers_nor_changes_of_the_policy(
+    record: Record,
+) -> None:
+    at_the_ends_alone(record)
+    record.run.uses = dict(EXTERNAL_USES)
+    refused(record, "answers: 50 questions were asked, not 0")
+    record.answers = {name: [] for name in record.answers}
+    refused(record, "policy: there must be none at stage 0, step 0")
+    record.policy = {name: [] for name in record.policy}
+    assert record.scenario.budget["test_questions"] == 50
+    scores = Scores.from_record(record)
+    assert scores.asked.sum() == 0
+    assert np.isnan(scores.activation_drift).all()
 
 
 @pytest.mark.parametrize(
@@ -78,9 +107,7 @@ def test_an_episode_that_is_not_planned_at_its_point_is_named(record: Record) ->
 def test_a_record_with_the_ends_of_stages_alone_is_whole_and_one_with_some_points_is_not(
     record: Record,
 ) -> None:
-    tables = ("episodes", "answers", "policy")
-    for name in tables:
-        setattr(record, name, without(getattr(record, name), lambda row: row[1] in (0, 400)))
+    at_the_ends_alone(record)
     ends = Scores.from_record(record)
     assert np.isnan(ends.on_the_way).all()
     assert ends.layout.curve_episodes == tuple(range(10))  # those that others have
@@ -98,3 +125,9 @@ def test_the_policy_is_measured_at_all_points_and_at_no_other(record: Record) ->
     record.policy = without(whole, lambda row: row[1] in (0, 400))
     record.add_policy(PolicyRow(1, 200, None, None, None, None))
     refused(record, "policy: there must be none at stage 1, step 200")
+
+
+def test_questions_are_asked_only_where_episodes_are_played(record: Record) -> None:
+    at_the_ends_alone(record)
+    record.add_answers(AnswerRow(1, 200, "left", 25, 20))
+    refused(record, "answers: there must be none at stage 1, step 200")

@@ -289,6 +289,14 @@ def test_an_impossible_episode_is_refused(
         Scores.from_record(record, partial=True)
 
 
+def test_an_episode_with_two_outcomes_is_refused(make_record: MakeRecord) -> None:
+    record = make_record(MATRIX)
+    first = [column[0] for column in record.episodes.values()]
+    append(record.episodes, *first[:5], 1 - first[5], *first[6:])
+    with pytest.raises(RecordError, match="an episode is there twice"):
+        Scores.from_record(record, partial=True)
+
+
 @pytest.mark.parametrize("split", ["test", "validation"])
 def test_an_episode_at_a_step_between_the_evaluation_points_is_refused(
     split: str, make_record: MakeRecord
@@ -408,4 +416,18 @@ def test_a_budget_that_would_take_all_memory_is_refused(name: str, make_record: 
     record = make_record(MATRIX, groups=(2, 2, 1))
     record.scenario.budget[name] = 10_001
     with pytest.raises(RecordError, match="tasks x episodes are 5 x 10,001, and 20,000 are the most"):
+        Scores.from_record(record, partial=True)
+
+
+def test_a_budget_of_exactly_the_most_cells_is_read(make_record: MakeRecord) -> None:
+    record = make_record(MATRIX, groups=(2, 2, 1))
+    record.scenario.budget["test_episodes"] = 20_000 // 5
+    np.testing.assert_allclose(Scores.from_record(record, partial=True).success.mean(axis=-1), MATRIX)
+
+
+@pytest.mark.parametrize("name", ["validation_episodes", "test_episodes", "curve_episodes"])
+def test_a_budget_of_fewer_than_no_episodes_is_refused(name: str, make_record: MakeRecord) -> None:
+    record = make_record(MATRIX)
+    record.scenario.budget[name] = -1
+    with pytest.raises(RecordError, match=f"{name} of its budget must be a whole number, not -1"):
         Scores.from_record(record, partial=True)
