@@ -1,12 +1,15 @@
-"""Size of the page, and time to make it from generated records: `python benchmarks/page.py`.
+"""Size of the page, and time to make and show it from generated records: `python benchmarks/page.py`.
 
 The records have the shape of Fetch-v1's. A method is two numbers: how well it learns, and how much it keeps.
-The goal is less than 3 MB and 20 s with 15 methods, 5 seeds and 4 scenarios.
+The goal is less than 3 MB and 20 s with 15 methods, 5 seeds and 4 scenarios. Where Chromium is installed, the
+published page is opened, too: it should show its first text within a second of an empty page's.
 """
 
 from __future__ import annotations
 
 import argparse
+import shutil
+import statistics
 import tempfile
 import time
 from itertools import product
@@ -33,6 +36,9 @@ BUDGET = {
     "validation_episodes": VALIDATION,
     "test_questions": KINDS * ASKED,
 }
+PUBLISHED = Path(__file__).parents[1] / "leaderboard" / "site" / "index.html"
+EMPTY = "data:text/html,<p>empty</p>"
+PAINT = "performance.getEntriesByName('first-contentful-paint')"
 REFERENCES = ("sft", "joint", "from_scratch", "frozen")
 """Methods with which others are compared."""
 
@@ -63,6 +69,26 @@ def main() -> None:
     for part, first, last in (("board", begin, read), ("page and pictures", read, end), ("all", begin, end)):
         wall, processor = (late - early for early, late in zip(first, last, strict=True))
         print(f"{part}: {wall:.1f} s, {processor:.1f} s of processor time")
+    if chromium := shutil.which("chromium") or shutil.which("chromium-browser"):
+        ours, empty = first_text(chromium, PUBLISHED.as_uri()), first_text(chromium, EMPTY)
+        print(f"first text of the published page: {ours:.0f} ms, of an empty page: {empty:.0f} ms")
+
+
+def first_text(chromium: str, address: str, times: int = 5) -> float:
+    """Return the milliseconds until a browser shows the first text of a page, the median of several times."""
+    from playwright.sync_api import sync_playwright  # only here: a browser is not needed otherwise
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        found: list[float] = []
+        for _ in range(times):
+            page = browser.new_page()
+            page.goto(address)
+            page.wait_for_function(f"{PAINT}.length")
+            found.append(page.evaluate(f"{PAINT}[0].startTime"))
+            page.close()
+        browser.close()
+    return statistics.median(found)
 
 
 def make_records(folder: Path, methods: int, seeds: int, scenarios: int) -> None:
