@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -276,3 +277,24 @@ def test_shuffled_weights_are_consfts_in_another_order() -> None:
     ours = consft.weights(losses, Progress(0, 100))
     assert theirs.tolist() != ours.tolist()
     assert theirs.sort().values.tolist() == ours.sort().values.tolist()
+
+
+def test_at_every_step_the_shuffled_weights_are_consfts_of_that_step() -> None:
+    losses = TransformerPolicy(SMALL).action_loss(toy_source("right", seed=2).sample(16))
+    consft: Any = build_method("consft", UNEVEN)
+    shuffled: Any = build_method("shuffled_weights", {**UNEVEN, "loss_scale": 1.0})
+    for step in (0, 60, 99):
+        found, expected = (one.weights(losses, Progress(step, 100)) for one in (shuffled, consft))
+        assert found.sort().values.tolist() == expected.sort().values.tolist()
+
+
+def test_every_order_of_the_weights_is_equally_likely_at_every_step() -> None:
+    losses = torch.tensor([0.1, 0.4, 0.9, 1.5])
+    shuffled: Any = build_method("shuffled_weights", {**UNEVEN, "loss_scale": 1.0})
+    orders: Counter[tuple[float, ...]] = Counter()
+    with seeded("orders"):
+        for _ in range(2400):
+            orders[tuple(shuffled.weights(losses, Progress(0, 100)).tolist())] += 1
+    assert len(orders) == 24
+    # 100 of each are expected, and 5 standard deviations are 49
+    assert all(51 <= count <= 149 for count in orders.values())

@@ -307,6 +307,14 @@ def test_co_training_descends_the_sum_of_both_losses() -> None:
     _check_close(_set_by(method, policy, (batch, questions)), _gradients(policy, loss))
 
 
+@pytest.mark.parametrize("progress", [Progress(0, 1000), Progress(999, 1000), Progress(40, 50, True)])
+def test_co_training_weighs_both_losses_the_same_at_every_step(progress: Progress) -> None:
+    policy, method = TransformerPolicy(SMALL), build_method("co_training", {"auxiliary": 0.3})
+    batch, questions = toy_source("right").sample(8), toy_questions().sample(8)
+    expected = policy.action_loss(batch).mean() + 0.3 * policy.answer_loss(questions).mean()
+    assert method.loss(policy, (batch, questions), progress).item() == pytest.approx(expected.item())
+
+
 @pytest.mark.parametrize("spec", ["co_training", "knowledge_insulation"])
 def test_half_as_many_questions_as_demonstrations_are_asked(spec: str) -> None:
     batch, questions = build_method(spec, {}).batch(toy_source("right"), _prior())

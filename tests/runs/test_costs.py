@@ -1,15 +1,21 @@
-"""What a run counts, and what it refuses: steps outside of the loop, buffers, and draws of the target."""
+"""What a run counts, and what it refuses: steps, parameters, kept data, seconds, and draws of the target."""
 
 import dataclasses
+import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+from tiny import TINY
 
+from clbench.data.training_data import TrainingData
 from clbench.learning.method import Method, MethodState, Stage
+from clbench.learning.pretraining import pretrained_policy
 from clbench.policy.policy import Policy
+from clbench.policy.transformer import TransformerPolicy
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.testing import TOY
@@ -56,6 +62,24 @@ class Hiding(Method):
 
     def load_state(self, policy: Policy, state: MethodState) -> None:
         policy.register_buffer("memory", torch.ones(16))
+
+
+@dataclasses.dataclass
+class Growing(Method):
+    """Adds five parameters to the policy."""
+
+    def prepare(self, policy: Policy, prior: Any) -> None:
+        policy.register_parameter("scale", torch.nn.Parameter(torch.zeros(5)))
+
+    def load_state(self, policy: Policy, state: MethodState) -> None:
+        self.prepare(policy, None)
+
+
+@dataclasses.dataclass
+class Keeping(Method):
+    """Keeps all demonstrations to the end."""
+
+    uses = dataclasses.replace(Method.uses, demonstrations="throughout")
 
 
 @dataclasses.dataclass
@@ -116,6 +140,62 @@ def test_a_buffer_that_the_method_added_is_kept_data(
 ) -> None:
     record = execute(RunSpec(ID, stranger(Hiding), seed=0), tmp_path)
     assert record.costs.bytes_kept == 16 * 4
+
+
+def test_demonstrations_that_are_kept_to_the_end_are_those_of_the_skills_and_of_earlier_targets(
+    stranger: Callable[[type[Method]], str], tmp_path: Path
+) -> None:
+    policy, _ = pretrained_policy(TINY, 0)
+    data = TrainingData.open(TINY, policy.config)
+    skills = sum(data.demonstrations(task).bytes for task in TINY.retained)
+    kept = [
+        execute(RunSpec(TINY.id, stranger(Keeping), seed=0, targets=count), tmp_path).costs.bytes_kept
+        for count in (1, 2)
+    ]
+    assert kept == [skills, skills + data.demonstrations(TINY.target[0]).bytes]
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_all_parameters_are_counted_also_frozen_ones_and_those_that_the_method_added(
+    stranger: Callable[[type[Method]], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make = TransformerPolicy.__init__
+
+    def half_frozen(self: TransformerPolicy, *args: Any, **kwargs: Any) -> None:
+        make(self, *args, **kwargs)
+        self.backbone_layers[0].requires_grad_(False)
+
+    monkeypatch.setattr(TransformerPolicy, "__init__", half_frozen)
+    record = execute(RunSpec(TINY.id, stranger(Growing), seed=0, targets=1), tmp_path)
+    policy, _ = pretrained_policy(TINY, 0)
+    assert record.costs.parameters == sum(value.numel() for value in policy.parameters())
+    assert record.costs.parameters_added == 5
+
+
+def test_the_seconds_of_a_run_hold_those_of_its_preparation_and_of_relearning(
+    stranger: Callable[[type[Method]], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begin = time.perf_counter()
+    now = [begin]
+
+    def taking(seconds: float) -> Callable[..., None]:
+        def wait(*_: Any) -> None:
+            now[0] += seconds
+
+        return wait
+
+    module = "clbench.runs.run"
+    monkeypatch.setattr(f"{module}.time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr(f"{module}.relearns", lambda _: True)
+    for name, seconds in (("relearn", 50), ("evaluate_start", 1000)):
+        monkeypatch.setattr(f"{module}.{name}", taking(seconds))
+    monkeypatch.setattr(Growing, "prepare", taking(10_000))
+    monkeypatch.setattr(Growing, "load_state", lambda *_: None)
+    record = execute(RunSpec(TINY.id, stranger(Growing), seed=0, targets=1), tmp_path)
+    assert (record.timing["preparation"], record.timing["relearning"]) == (10_000, 50)
+    # the run itself takes its beginning from the real clock, a little later than here
+    late = 11_050 - record.timing["seconds"]
+    assert -0.01 < late < time.perf_counter() - begin + 0.01
 
 
 @pytest.mark.parametrize(

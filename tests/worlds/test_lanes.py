@@ -1,9 +1,12 @@
+import contextlib
 import dataclasses
 import functools
+from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from clbench.base.entry_points import resolve
 from clbench.spec.registry import load_scenario
@@ -81,6 +84,47 @@ def test_each_lane_runs_the_episode_of_the_plain_world_whichever_world_it_is_in(
     lanes.close()
 
 
+def test_two_tasks_of_one_world_run_side_by_side_each_in_its_own_lane() -> None:
+    lanes, tasks, worlds = Lanes(3), [LEFT, UP, LEFT], [ToyWorld() for _ in range(3)]
+    order = [1, 2, 0]
+    lanes.reset(order, order, [tasks[lane] for lane in order])
+    for lane, world in enumerate(worlds):
+        world.reset(seed=lane, options={"task": tasks[lane].name})
+    for moving in ([0, 1, 2], [2, 1], [1], [2, 0]):
+        actions = np.array([[-0.5, 0.3 * lane] for lane in moving], np.float32)
+        states, rewards, successes = lanes.step(moving, actions)
+        outcomes = [worlds[lane].step(action)[:3] for lane, action in zip(moving, actions, strict=True)]
+        np.testing.assert_array_equal(states, [state for state, _, _ in outcomes])
+        assert [*zip(rewards, successes, strict=True)] == [(reward, done) for _, reward, done in outcomes]
+
+
+class ImpatientWorld(ToyWorld):
+    """A toy world that cuts every episode off after a step."""
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        state, reward, terminated, _, info = super().step(action)
+        return state, reward, terminated, True, info
+
+
+def test_an_episode_that_its_world_cuts_off_is_no_success() -> None:
+    world = PlainVectorWorld(ImpatientWorld, lanes=1)
+    world.reset([0], [3], ["left"])
+    _, _, successes = world.step([0], np.zeros((1, 2), np.float32))
+    assert successes.tolist() == [False]
+
+
+def test_closed_lanes_have_no_episode_until_they_are_reset() -> None:
+    lanes = Lanes(1)
+    first, world = episode(lanes, 0, 3, LEFT, perturbed=False), lanes.world(LEFT)
+    lanes.close()
+    with pytest.raises(gymnasium.error.ResetNeeded, match="Lane 0 has no episode"):
+        lanes.step([0], np.zeros((1, 2), np.float32))
+    assert episode(lanes, 0, 3, LEFT, perturbed=False) == first
+    assert lanes.world(LEFT) is not world
+
+
 def test_a_lane_goes_from_one_world_to_another(other_task: Task) -> None:
     lanes = Lanes(1)
     for task in (LEFT, other_task, LEFT):
@@ -141,3 +185,15 @@ def test_an_error_names_the_task_whose_world_cannot_be_perturbed_and_the_way_out
         raised.value
     )
     assert Lanes(1).reset([0], [3], [task]).shape == (1, 4)
+
+
+@pytest.mark.parametrize(("plain", "own", "can"), [(False, True, True), (True, False, False)])
+def test_of_a_world_with_a_vector_world_the_vector_world_says_whether_it_can_be_perturbed(
+    plain: bool, own: bool, can: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vector = type("Vector", (OwnVectorWorld,), {"perturbable": own})
+    world = type("World", (ToyWorld,), {"perturbable": plain, "vector_world": vector})
+    monkeypatch.setattr("clbench.testing.EitherWorld", world, raising=False)
+    task = dataclasses.replace(UP, world="clbench.testing:EitherWorld")
+    with contextlib.nullcontext() if can else pytest.raises(ValueError, match="cannot be perturbed"):
+        check_perturbable([task])

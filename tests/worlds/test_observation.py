@@ -147,6 +147,26 @@ def test_pictures_change_in_perturbed_episodes_alone() -> None:
     assert np.array_equal(again, images[1])
 
 
+def test_each_lane_is_seen_through_the_camera_of_its_task_with_the_view_of_its_seed(
+    camera_of: Callable[[str], str],
+) -> None:
+    camera = camera_of("    proprioception = staticmethod(lambda states: states[:, 1:2])\n")
+    other = dataclasses.replace(TASK, camera=camera)
+    lanes, views = (
+        Lanes(4),
+        {3: draw_perturbation(5).view, 0: draw_perturbation(3).view, 2: [0.0] * VIEW_SIZE},
+    )
+    started = lanes.reset([3, 0, 2], [5, 3, 4], [TASK, other, TASK], [True, True, False])
+    states = dict(zip([3, 0, 2], started, strict=True))
+    for shown, tasks, columns in (([0, 2, 3], [other, TASK, TASK], [1, 0, 0]), ([2, 3], [TASK] * 2, [0, 0])):
+        rows = np.stack([states[lane] for lane in shown])
+        numbers, images = lanes.observe(shown, tasks, rows)
+        assert numbers[:, 0].tolist() == [row[column] for row, column in zip(rows, columns, strict=True)]
+        expected = ToyCamera().draw(rows, np.array([views[lane] for lane in shown], np.float32))
+        assert np.array_equal(images, expected)
+    lanes.close()
+
+
 def test_pictures_of_a_data_set_are_drawn_once(empty_caches: Path) -> None:
     first = observed(TASK, _states(5))
     (file,) = cache_folder().rglob("frames.safetensors")

@@ -39,6 +39,10 @@ def test_a_perturbation_follows_from_the_seed_alone_and_never_changes() -> None:
     assert drawn == Perturbation(0.5, start, view)
 
 
+def test_a_thing_is_half_or_twice_as_heavy() -> None:
+    assert {draw_perturbation(seed).mass for seed in range(20)} == {0.5, 2.0}
+
+
 def test_all_masses_and_all_sides_are_drawn() -> None:
     drawn = [draw_perturbation(seed) for seed in range(400)]
     shares = [sum(one.mass == mass for one in drawn) / 400 for mass in MASSES]

@@ -1,9 +1,11 @@
 """Scenarios as Gymnasium environments, for Gymnasium's own tools and for Stable-Baselines3."""
 
+import dataclasses
 import os
 import pickle
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ import pytest
 from clbench.spec.identifiers import scenario_ids
 from clbench.spec.language import encode
 from clbench.spec.registry import load_scenario
+from clbench.testing import TOY, ToyWorld
 from clbench.worlds.scenario_env import ScenarioEnv
 
 FETCH = "clbench/Fetch-v1"
@@ -35,6 +38,32 @@ def test_the_schedule_goes_from_the_skills_to_each_target_and_stays_at_the_last(
         schedule.append((info["stage"], info["task"]))
     skills = [(0, "left"), (0, "up"), (0, "left")]
     assert schedule == skills + [(1, "right")] * 3 + [(2, "down")] * 6
+
+
+def test_without_skills_the_schedule_begins_with_the_first_target() -> None:
+    scenario = dataclasses.replace(TOY, retained=(), scenes=TOY.target)
+    env = ScenarioEnv(scenario, episodes_per_stage=2)
+    for options in (None, {"stage": 1}):
+        schedule = [env.reset(options=options)[1]] + [env.reset()[1] for _ in range(4)]
+        found = [(info["stage"], info["task"]) for info in schedule]
+        assert found == [(1, "right")] * 2 + [(2, "down")] * 3
+    with pytest.raises(ValueError, match="has stages 1 to 2, not 0"):
+        env.reset(options={"stage": 0})
+
+
+@pytest.mark.parametrize(("stage", "tasks"), [(0, ["left", "up"] * 2), (1, ["right"] * 4), (2, ["down"] * 4)])
+def test_an_environment_of_one_stage_never_leaves_it(stage: int, tasks: list[str]) -> None:
+    env = _toy(stage=stage, episodes_per_stage=1)
+    schedule = [env.reset()[1] for _ in range(4)]
+    assert [(info["stage"], info["task"]) for info in schedule] == [(stage, task) for task in tasks]
+
+
+def test_a_chosen_task_has_the_stage_that_trains_it_and_is_no_episode_of_the_schedule() -> None:
+    env = _toy(episodes_per_stage=2)
+    names = ("left", "right", "down", "up_left")
+    stages = {name: env.reset(options={"task": name})[1]["stage"] for name in names}
+    assert stages == {"left": 0, "right": 1, "down": 2, "up_left": 0}
+    assert [env.reset()[1]["task"] for _ in range(3)] == ["left", "up", "right"]
 
 
 @pytest.mark.parametrize("vector", [False, True])
@@ -64,6 +93,19 @@ def test_a_seed_begins_the_schedule_anew_and_repeats_it_bit_for_bit() -> None:
     first = schedule()
     assert len({state for _, _, state in first}) == 5
     assert schedule() == first
+
+
+def test_a_seed_draws_the_wording_and_then_the_start_of_each_episode() -> None:
+    env, generator, wordings = _toy(), np.random.default_rng(5), set()
+    for number in range(8):
+        observation, info = env.reset(seed=None if number else 5)
+        known = TOY.task(info["task"]).instructions
+        assert info["instruction"] == known[generator.integers(len(known))]
+        seed = int(generator.integers(2**31))
+        state, _ = ToyWorld().reset(seed=seed, options={"task": info["task"]})
+        assert np.array_equal(observation["state"], state)
+        wordings.add(info["instruction"])
+    assert wordings == {words for task in TOY.retained for words in task.instructions}
 
 
 def test_options_choose_a_task_or_a_stage() -> None:
@@ -114,6 +156,21 @@ def test_an_episode_ends_with_success_or_at_the_horizon() -> None:
     assert not any(result[2] for result in results)
 
 
+def test_steps_add_up_over_episodes_and_the_first_episode_gives_the_time_of_the_start() -> None:
+    env, begun = _toy(), []
+    assert (env.steps_taken, env.begun_at) == (0, None)
+    before = time.perf_counter()
+    for _ in range(3):
+        env.reset()
+        begun.append(env.begun_at)
+        for _ in range(4):
+            env.step(np.zeros(2, np.float32))
+    assert env.steps_taken == 12
+    assert begun == [begun[0]] * 3
+    assert begun[0] is not None
+    assert before <= begun[0] <= time.perf_counter()
+
+
 def test_observation_and_info_carry_the_instruction() -> None:
     env = gymnasium.make(FETCH, instruction="tokens")
     observation, info = env.reset(seed=0, options={"task": "press"})
@@ -123,6 +180,18 @@ def test_observation_and_info_carry_the_instruction() -> None:
     assert set(info) == {"task", "stage", "instruction", "success"}
     assert isinstance(env.unwrapped, ScenarioEnv)
     assert env.unwrapped.scenario is load_scenario(FETCH)
+
+
+def test_tokens_have_the_length_of_the_longest_text_of_the_scenario() -> None:
+    long = "go left and " * 6 + "stop"
+    left = dataclasses.replace(TOY.retained[0], instructions=(long,))
+    scenario = dataclasses.replace(TOY, retained=(left, TOY.retained[1]))
+    env = ScenarioEnv(scenario, instruction="tokens")
+    for words in (long, None):
+        observation, info = env.reset()
+        assert words in (None, info["instruction"])
+        assert np.array_equal(observation["instruction"], encode([info["instruction"]], 24)[0])
+        assert env.observation_space.contains(observation)
 
 
 @pytest.mark.parametrize("mode", ["sync", "async"])

@@ -79,6 +79,36 @@ def test_options_choose_for_all_and_seeds_for_each() -> None:
     assert not np.array_equal(third["state"], first["state"])
 
 
+def test_steps_of_all_environments_add_up_without_those_that_only_begin_an_episode() -> None:
+    env, expected, ended = _toy(), 0, np.zeros(2, np.bool_)
+    env.reset(seed=0, options={"task": "left"})
+    begun = env.begun_at
+    assert begun is not None
+    # to the left the first environment succeeds where its task is left; the second one never does
+    actions = np.array([[-1.0, 0.0], [1.0, 0.0]], np.float32)
+    for _ in range(30):
+        expected += int((~ended).sum())
+        _, _, terminated, truncated, _ = env.step(actions)
+        ended = terminated | truncated
+    assert 30 < expected < 60
+    assert env.steps_taken == expected
+    env.reset()
+    assert (env.steps_taken, env.begun_at) == (expected, begun)
+
+
+def test_after_a_reset_no_episode_that_had_ended_begins_once_more() -> None:
+    envs = [_toy(), gymnasium.make_vec(TOY, num_envs=2, vectorization_mode="sync")]
+    actions = np.array([[-1.0, 0.0], [1.0, 0.0]], np.float32)
+    outcomes: list[Any] = []
+    for env in envs:
+        env.reset(seed=0, options={"task": "left"})
+        while not env.step(actions)[2].any():
+            pass
+        outcomes.append([env.reset(), env.step(actions), env.step(actions)])
+    for ours, plain in zip(*outcomes, strict=True):
+        _same(ours, plain)
+
+
 @pytest.mark.parametrize("seed", [np.int64(4), [np.int32(4), 5], np.array([4, 5])])
 def test_a_seed_may_be_any_whole_number(seed: Any) -> None:
     env = _toy()
