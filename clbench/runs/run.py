@@ -367,10 +367,9 @@ class _Run:
                 continue
             if self.kept is not None and not has_stages(self.run, self.kept, number):
                 continue
-            started = self.record.timing["started"]
             self.record = read_record(folder / "record.json")
             self.seconds_before = self.record.timing["seconds"]
-            self.record.timing.update({"started": started, "resumed_after": number})
+            self.record.timing["resumed_after"] = number
             length = run_length(self.run.scenario, self.run.protocol) - relearning_length(self.run.protocol)
             self.progress(number * length / max(targets, 1))
             return number

@@ -142,6 +142,7 @@ def test_a_buffer_that_the_method_added_is_kept_data(
     assert record.costs.bytes_kept == 16 * 4
 
 
+@pytest.mark.long
 def test_demonstrations_that_are_kept_to_the_end_are_those_of_the_skills_and_of_earlier_targets(
     stranger: Callable[[type[Method]], str], tmp_path: Path
 ) -> None:
@@ -155,6 +156,7 @@ def test_demonstrations_that_are_kept_to_the_end_are_those_of_the_skills_and_of_
     assert kept == [skills, skills + data.demonstrations(TINY.target[0]).bytes]
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("empty_caches")
 def test_all_parameters_are_counted_also_frozen_ones_and_those_that_the_method_added(
     stranger: Callable[[type[Method]], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
