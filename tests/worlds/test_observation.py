@@ -152,10 +152,8 @@ def test_each_lane_is_seen_through_the_camera_of_its_task_with_the_view_of_its_s
 ) -> None:
     camera = camera_of("    proprioception = staticmethod(lambda states: states[:, 1:2])\n")
     other = dataclasses.replace(TASK, camera=camera)
-    lanes, views = (
-        Lanes(4),
-        {3: draw_perturbation(5).view, 0: draw_perturbation(3).view, 2: [0.0] * VIEW_SIZE},
-    )
+    lanes = Lanes(4)
+    views = {3: draw_perturbation(5).view, 0: draw_perturbation(3).view, 2: [0.0] * VIEW_SIZE}
     started = lanes.reset([3, 0, 2], [5, 3, 4], [TASK, other, TASK], [True, True, False])
     states = dict(zip([3, 0, 2], started, strict=True))
     for shown, tasks, columns in (([0, 2, 3], [other, TASK, TASK], [1, 0, 0]), ([2, 3], [TASK] * 2, [0, 0])):
@@ -177,6 +175,33 @@ def test_pictures_of_a_data_set_are_drawn_once(empty_caches: Path) -> None:
     assert np.array_equal(first[1], again[1])
     assert file.stat().st_mtime_ns == written
     assert other[1].shape == (6, 16, 16, 3)
+    assert len(list(cache_folder().rglob("frames.safetensors"))) == 2
+
+
+def test_each_data_set_has_its_own_pictures_also_if_it_has_the_size_of_another(empty_caches: Path) -> None:
+    states = _states(10)
+    for some in (states[:5], states[5:]):
+        numbers, images = observed(TASK, some)
+        assert np.array_equal(numbers, some[:, :1])
+        assert np.array_equal(images, ToyCamera().draw(some, np.zeros((5, VIEW_SIZE), np.float32)))
+
+
+def test_where_the_source_of_the_camera_changes_a_data_set_is_observed_anew(
+    camera_of: Callable[[str], str], empty_caches: Path
+) -> None:
+    states = _states(5)
+    for columns, shown in (("-1:", states[:, -1:]), (":1", states[:, :1])):
+        lines = f"    proprioception = staticmethod(lambda states: states[:, {columns}])\n"
+        numbers, _ = observed(dataclasses.replace(TASK, camera=camera_of(lines)), states)
+        assert np.array_equal(numbers, shown)
+
+
+def test_where_another_renderer_draws_a_data_set_is_observed_anew(
+    empty_caches: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    observed(TASK, _states(5))
+    monkeypatch.setattr("clbench.worlds.observation.frame_hash", lambda _: "of another renderer")
+    observed(TASK, _states(5))
     assert len(list(cache_folder().rglob("frames.safetensors"))) == 2
 
 
