@@ -41,8 +41,8 @@ Act = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 INTRODUCTION = f"""\
 # What else succeeds
 
-A success rule judges where things end, not how they came there. This page shows what succeeds on a task
-besides having learned it: doing nothing, uniformly random actions, and the experts of the scenario's other
+A success rule judges the state that is reached, not the way there. This page shows what succeeds on a task
+without having learned it: doing nothing, uniformly random actions, and the experts of the scenario's other
 tasks, background included ({EPISODES} episodes each; experts below {LEAST} are left out). Read `learned` and
 `kept` of a task beside these rates: where the expert of another task succeeds, a policy that does the other
 task's motion also counts as knowing this one.

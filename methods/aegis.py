@@ -6,6 +6,9 @@ layer form a diagonal Gaussian: the anchor. Each step differentiates the action 
 a negative inner product d, a step that lowers the loss would raise the distance. The part of the loss's
 gradient along the anchor's gradient is then removed: g - d / ||g_anchor||^2 g_anchor (Eq. 12 and 13).
 
+Formulas and constants are from notes by other readers of the paper. We have read its abstract only: "the
+paper" below is the paper as these notes describe it.
+
 Details:
 1. The anchor is computed on the benchmark's training questions instead of 3,000 questions of VQAv2, from all
    tokens except padding. Mean and deviation are kept per channel: the paper writes "means and variances" of a

@@ -5,6 +5,9 @@ through omega (Eq. 5, 11 and 12). The temperature tau rises from `tau_start` to 
 training begins conservatively, and ends as plain fine-tuning where losses are small against tau_end / kappa,
 which is 0.2. The method adds no data, no network and no memory.
 
+Formulas and constants are from two notes by other readers of the paper, which agree. We have read its
+abstract only: "the paper" below is the paper as these notes describe it.
+
 Details:
 1. The batch loss is the mean of omega_i L_i. It is never divided by the sum of the weights: that would cancel
    most of the method.

@@ -7,11 +7,16 @@ objective and one without, give two sets of weights; their difference is the cap
 added to the pretrained weights (Eq. 4). Plain fine-tuning follows, with a penalty on moving the weights where
 the vector is large: lambda sum_i |g_i (theta_i - theta_meta_i)| (Eq. 7 and 8).
 
+CapVector's equations, tables and constants are from a note by another reader, and two digests agree with it.
+We have read that paper's abstract only: "the paper" below is the paper as this note describes it. We have
+read the whole paper of Fast-dVLA.
+
 Details:
 1. The auxiliary objective is to answer questions. The paper's Spatial Forcing aligns hidden states with those
    of a vision model instead: both give the backbone a second task besides acting. But the paper's second task
-   is new to the policy, while questions are a part of the pretraining here. The vector is therefore largely
-   what 150 steps without questions cost: on Fetch-v1, seed 0, the two fine-tunings differ by 0.78 in norm,
+   is new to the policy, while questions are a part of the pretraining here. The vector therefore
+   mostly shows the cost of 150 steps without questions:
+   on Fetch-v1, seed 0, the two fine-tunings differ by 0.78 in norm,
    and move from the pretrained policy by 1.04 in directions with a cosine of 0.73. A scenario whose policy
    has not been pretrained on questions would test the paper's premise more directly.
 2. Both fine-tunings see the same demonstrations of all retained skills, in the same order with the same

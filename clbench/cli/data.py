@@ -90,6 +90,7 @@ def export(
     *tasks: str,
     format: Literal["lerobot", "hdf5"],  # noqa: A002 - the word that everyone uses
     output: Path,
+    noisy: bool = True,
     workers: Annotated[int | None, whole_number(1)] = None,
 ) -> None:
     """Export the demonstrations of SCENARIO, or of TASKS alone, for other libraries.
@@ -103,6 +104,7 @@ def export(
         format: lerobot for one LeRobotDataset v3, with the instructions as its tasks, or hdf5 for a file
             TASK_demo.hdf5 for each task, in the layout of robomimic and LIBERO.
         output: New folder.
+        noisy: Whether to export the episodes with action noise, too: --no-noisy leaves them out.
         workers: Number of tasks to collect at once (default: all cores).
     """
     from clbench.exchange.demonstrations import check_output, chosen_tasks, export_demonstrations
@@ -114,7 +116,9 @@ def export(
         check_folders({"--output": output})
     _collect(scenario, loaded, chosen, workers)
     with checked_input():
-        folder = export_demonstrations(loaded, output, format=format, tasks=[task.name for task in chosen])
+        folder = export_demonstrations(
+            loaded, output, format=format, tasks=[task.name for task in chosen], noisy=noisy
+        )
     text = f"{counted(len(chosen), 'task')} of {loaded.id} in {folder}"
     print_plain(Console(), text)
 

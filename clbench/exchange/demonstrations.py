@@ -42,6 +42,7 @@ def export_demonstrations(
     *,
     format: Format,  # noqa: A002 - the word that everyone uses
     tasks: Iterable[str] = (),
+    noisy: bool = True,
 ) -> Path:
     """Export demonstrations, which are collected on first use, and return the folder that holds them.
 
@@ -51,9 +52,11 @@ def export_demonstrations(
         format: "lerobot" for one LeRobotDataset v3 of all tasks, or "hdf5" for one file of the layout of
             robomimic and LIBERO for each task, `TASK_demo.hdf5`.
         tasks: Names of tasks, or one name; the retained skills and the targets if there are none.
+        noisy: Whether to export the episodes with action noise, too.
 
     Raises:
-        InputError: The folder exists or cannot be made, or a world does not give its steps per second.
+        InputError: The folder exists or cannot be made, a world does not give its steps per second, or a task
+            has no episode without action noise.
         UnknownNameError: The format or a name is unknown.
         MissingPackageError: A package is not installed.
         LeakError: The running hooks of a method must not read them.
@@ -64,6 +67,8 @@ def export_demonstrations(
     for task in chosen:
         check_demonstrations(task.name)
     found = {task: read_dataset(dataset_folder(task, loaded.budget)) for task in chosen}
+    if not noisy:
+        found = {task: _without_noise(task, episodes) for task, episodes in found.items()}
     return _in_one_step(folder, lambda partial: _WRITERS[format](partial, found))
 
 
@@ -97,6 +102,13 @@ def check_output(output: Path | str, kind: str, tasks: Sequence[Task]) -> Path:
     if os.path.lexists(output):
         raise InputError(f"{output} exists: an export makes a new folder.")
     return Path(output)
+
+
+def _without_noise(task: Task, episodes: Sequence[Demonstration]) -> Sequence[Demonstration]:
+    clean = [episode for episode in episodes if not episode.noisy.any()]
+    if not clean:
+        raise InputError(f"All {counted(len(episodes), 'demonstration')} of {task.name} have action noise.")
+    return clean
 
 
 def _write_files(folder: Path, tasks: Mapping[Task, Sequence[Demonstration]]) -> None:

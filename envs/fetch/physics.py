@@ -102,9 +102,9 @@ class _Lane:
 class FetchVectorWorld:
     """The scene, the physics and the observation of FetchPickAndPlace-v4, with the tasks of `RULES`.
 
-    An action (4,) in [-1, 1] moves the goal of the gripper by up to 5 cm along x, y and z, of which the arm
-    covers about 3 cm per step of 0.04 s, and opens (+1) or closes (-1) the fingers. The reward is minus the
-    metres that the gripper and the block still have to move, plus 1 on success.
+    An action (4,) in [-1, 1] moves the goal of the gripper by up to 5 cm along x, y and z, and opens (+1)
+    or closes (-1) the fingers. In a step of 0.04 s the arm covers about 3 cm of the way. The
+    reward is minus the metres that the gripper and the block still have to move, plus 1 on success.
 
     It is a `clbench.worlds.world.VectorWorld`. `Rule.judge` computes the reward. Only success ends an
     episode; the caller counts its steps.

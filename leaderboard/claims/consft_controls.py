@@ -64,6 +64,6 @@ def what_controls_say(gain: Figure, figures: Sequence[Figure], arms: Sequence[st
     """Return what the controls of the arms that count say of a gain over sft, if there is one."""
     if gain.low <= 0:
         method, other = gain.methods[:2]
-        return [f"{method} does not certainly keep more than {other}: no gain is there to be explained."]
+        return [f"{method} does not certainly keep more than {other}: there is no gain to explain."]
     says = [(one, *CONTROLS[one.methods[1]]) for one in figures if one.methods[0] in arms]
     return [not_told_apart(figure, explains=yes, does_not=no) for figure, yes, no in says]

@@ -260,7 +260,7 @@ def over_tied(name: str, words: str, gain: Estimate, tied: Sequence[TiedGain]) -
         yield (
             f"On {name}, {'for' if sure else 'not for'} certain: {words} gains {chosen} over plain "
             f"fine-tuning at the setting that tuning chose, {'and' if sure else 'but'} {other} at "
-            f"{rate_text(one.factor)}, which tuning rated as highly ({counted(one.seeds, 'seed')})."
+            f"{rate_text(one.factor)}, which scored the same in tuning ({counted(one.seeds, 'seed')})."
         )
 
 

@@ -265,6 +265,26 @@ def test_what_cannot_be_exported_is_refused_before_any_work(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_episodes_with_action_noise_can_be_left_out(tmp_path: Path, episodes: list[Demonstration]) -> None:
+    clean = [episode for episode in episodes if not episode.noisy.any()]
+    assert 0 < len(clean) < len(episodes)
+    folder = export_demonstrations(TOY, tmp_path / "clean", format="lerobot", noisy=False)
+    assert _info(folder)["total_episodes"] == len(clean)
+    rows = _rows(next((folder / "data").rglob("*.parquet")))
+    assert np.array_equal(np.stack(rows["action"]), np.concatenate([episode.action for episode in clean]))
+    assert not rows["noisy"].any()
+
+
+def test_a_task_whose_episodes_all_have_action_noise_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, episodes: list[Demonstration]
+) -> None:
+    noisy = [episode for episode in episodes if episode.noisy.any()]
+    monkeypatch.setattr("clbench.exchange.demonstrations.read_dataset", lambda _: noisy)
+    with pytest.raises(InputError, match=rf"All {len(noisy)} demonstrations of left have action noise"):
+        export_demonstrations(TOY, tmp_path / "clean", format="lerobot", tasks=["left"], noisy=False)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_an_export_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise OSError("No space left on device")
