@@ -33,6 +33,7 @@ from clbench.policy.kinds import policy_class
 from clbench.runs.length import run_length
 from clbench.runs.run import execute
 from clbench.runs.spec import ResolvedRun, RunSpec
+from clbench.spec.policies import kind_of
 from clbench.worlds.lanes import Lanes
 
 PARTS = {
@@ -85,7 +86,7 @@ def measure(run: ResolvedRun) -> dict[str, Any]:
     clocks: defaultdict[str, float] = defaultdict(float)
     steps = _counted_steps()
     # each kind of policy has its own `act`
-    timed = {**PARTS, "policy": (policy_class(run.scenario.policy), ("act",))}
+    timed = {**PARTS, "policy": (policy_class(kind_of(run.scenario.policy)), ("act",))}
     for part, (owner, names) in timed.items():
         for name in names:
             setattr(owner, name, _clocked(getattr(owner, name), clocks, part))

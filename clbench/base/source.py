@@ -128,8 +128,9 @@ def _origin(module: str) -> Path | None:
     """
     try:
         spec = importlib.util.find_spec(module)
-    except ValueError:  # `__main__` has no spec
+    except ValueError:  # `__main__` has no spec; the file of a script on standard input is called <stdin>
         spec, file = None, getattr(sys.modules.get(module), "__file__", None)
+        file = file if file is not None and Path(file).is_file() else None
     else:
         file = spec.origin if spec is not None else None
     if spec is None and module not in sys.modules:

@@ -27,7 +27,7 @@ from clbench.cli.arguments import (
     whole_number,
 )
 from clbench.jobs.folders import check_folders
-from clbench.spec.policies import DEFAULT_POLICY, SMALL, policy_name
+from clbench.spec.policies import DEFAULT_POLICY, SMALL, kind_of, policy_name
 
 if TYPE_CHECKING:
     from clbench.data.expert_rates import Measurement
@@ -196,7 +196,7 @@ def pretrain(
         loaded = load_scenario(scenario).with_policy(policy_name(policy, policy_size))
         if ship and not (SHIPPED.parents[1] / "pyproject.toml").is_file():
             raise InputError("--ship needs a checkout of clbench: it does not change an installed package.")
-        policy_class(loaded.policy)
+        policy_class(kind_of(loaded.policy))
     length = loaded.budget.pretraining_steps + vision_steps(loaded)
     with checked_input(), Bars(length) as bars:  # an expert may fail, the disk may be full
         name = f"{loaded.id} pretraining seed {seed}"

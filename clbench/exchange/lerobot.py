@@ -20,7 +20,6 @@ import pyarrow as pa
 import pyarrow.parquet as parquet
 from numpy.typing import NDArray
 
-from clbench.base.dependencies import require
 from clbench.base.errors import InputError
 from clbench.data.demonstrations import Demonstration
 from clbench.exchange.shown import Shown, shown, steps_per_second
@@ -157,7 +156,6 @@ def _array(values: NDArray[Any], kind: str) -> pa.Array:
 
 def _png(picture: NDArray[np.uint8]) -> bytes:
     """Return a picture (N, N, 3) as a PNG file, which loses nothing."""
-    require("PIL", "film", "A LeRobotDataset with pictures")
     from PIL import Image
 
     file = io.BytesIO()

@@ -103,7 +103,7 @@ def step_seconds(scenario: Scenario) -> float:
         chunk = (size, config.chunk, config.action_size)
         batch = Batch(
             state=torch.randn(size, config.state_size),
-            words=torch.as_tensor(encode(scenario.target[0].instructions[:1] * size, scenario.text_length)),
+            words=encode(scenario.tasks[0].instructions[:1] * size, scenario.text_length),
             action=torch.randn(chunk),
             valid=torch.ones(chunk[:2]),
             draw=torch.rand(size),

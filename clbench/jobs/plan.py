@@ -14,8 +14,9 @@ from clbench.records.paths import table_name
 from clbench.runs.length import point_length, run_length, training_length, watching_length
 from clbench.runs.spec import ResolvedRun
 from clbench.runs.start import is_evaluated
-from clbench.spec.identifiers import folder_name
+from clbench.spec.identifiers import folder_name, without_module
 from clbench.spec.limits import Limits
+from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 
@@ -130,7 +131,7 @@ class Plan:
         limits: Limits | None = None,
         records: Path | None = None,
     ) -> Job:
-        title = _title(_place(run), title)
+        title = _title(run.spec.scenario, title, run.spec.policy)
         product = None if records is None else _record_of(run, records)
         job = Job(title, function, {**arguments}, length, needs, limits, run.spec.device, _pace(run), product)
         self._runs.append(job)
@@ -162,7 +163,7 @@ class Plan:
             self._question_job(name, scenario),
             *self.add_demonstrations(name, scenario, scenario.pretrained),
         )
-        title = _title(table_name(name, scenario.policy), f"pretraining seed {seed}")
+        title = _title(name, f"pretraining seed {seed}", scenario.policy)
         arguments = {"scenario": name, "policy": scenario.policy, "seed": seed}
         return Job(title, work.pretrain, arguments, steps, needs)
 
@@ -179,7 +180,8 @@ class Plan:
                 self._starts[key] = None
             else:
                 needs = (*((policy,) if policy else ()), self._question_job(spec.scenario, run.scenario))
-                title = _title(_place(run), f"evaluation of the pretrained policy {_seed(run)}")
+                text = f"evaluation of the pretrained policy {_seed(run)}"
+                title = _title(spec.scenario, text, spec.policy)
                 length = point_length(run.protocol, run.protocol.end(0))
                 self._starts[key] = Job(
                     title, work.evaluate_policy, {"spec": spec}, length, needs, device=spec.device
@@ -236,13 +238,9 @@ def _pace(run: ResolvedRun) -> float:
     return REPLAY_PACE if replays else 1.0
 
 
-def _place(run: ResolvedRun) -> str:
-    return table_name(run.spec.scenario, run.spec.policy)
-
-
-def _title(name: str, text: str) -> str:
-    """Return the title of a job of the scenario `name`."""
-    return f"{folder_name(name.rpartition(':')[2])} {text}"
+def _title(scenario: str, text: str, policy: str = DEFAULT_POLICY) -> str:
+    """Return the title of a job of a scenario and a policy; no other job of a plan has it."""
+    return f"{folder_name(table_name(without_module(scenario), policy))} {text}"
 
 
 def _label(run: ResolvedRun) -> str:

@@ -89,10 +89,11 @@ def do_run(
     from clbench.scoring.metrics import measure
     from clbench.scoring.scores import WEAK, Scores
 
-    record = execute(spec, records, progress, checkpoints=checkpoints, tensorboard=tensorboard)
+    run = spec.resolve()
+    record = execute(run, records, progress, checkpoints=checkpoints, tensorboard=tensorboard)
     if record.error is not None:
         raise JobError(
-            shortened(f"failed in {record.failure}", spec.path(records).relative_to(records).as_posix())
+            shortened(f"failed in {record.failure}", run.path(records).relative_to(records).as_posix())
         )
     scores = Scores.from_record(record)
     names = ["adaptation", "retention", "question_retention"]

@@ -57,10 +57,11 @@ def load_method(spec: str) -> type[Method]:
 def describe_method(cls: type[Method]) -> dict[str, Any]:
     """Return a method's metadata, and as `source` the hash of its package or of its module.
 
-    For a class that was typed at a prompt, `source` is the hash of the class.
+    For a class that was typed at a prompt, `source` is the hash of the class and of what it derives from.
     """
     source = source_hash(*method_packages(cls))
-    typed = [class_hash(base) for base in _method_classes(cls) if not has_source(base.__module__)]
+    own = (base for base in cls.__mro__ if base not in Method.__mro__)
+    typed = [class_hash(base) for base in own if not has_source(base.__module__)]
     if typed:
         source = hash_of([source, *typed])
     return {**dataclasses.asdict(cls.metadata), "source": source}
@@ -68,12 +69,8 @@ def describe_method(cls: type[Method]) -> dict[str, Any]:
 
 def method_packages(cls: type[Method]) -> list[str]:
     """Return the packages, or modules, of a method and of the methods that it derives from."""
-    return sorted({package_of(base.__module__) for base in _method_classes(cls)})
-
-
-def _method_classes(cls: type[Method]) -> list[type[Method]]:
-    """Return a method and the methods that it derives from."""
-    return [base for base in cls.__mro__ if issubclass(base, Method) and base is not Method]
+    bases = (base for base in cls.__mro__ if issubclass(base, Method) and base is not Method)
+    return sorted({package_of(base.__module__) for base in bases})
 
 
 def read_changes(spec: str, cls: type[Method], changes: Mapping[str, Any]) -> dict[str, Any]:

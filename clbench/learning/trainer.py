@@ -262,11 +262,11 @@ def load_stage(folder: Path, method: Method, device: torch.device | str, policy:
     return load_policy(folder, lambda made: method.load_state(made, state), policy).to(device)
 
 
-def training_inputs(scenario: Scenario, seed: int, *modules: str) -> dict[str, Any]:
-    """Return the code, with `modules`, and the data that any result of a run depends on, as JSON."""
+def training_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
+    """Return the code and the data that any result of a run depends on, besides its method, as JSON."""
     suites = {*packages_of(scenario.tasks, "world", "expert", "camera"), *policy_packages(scenario.policy)}
     return {
         "pretraining": pretraining_inputs(scenario, seed),
         "tasks": [dataclasses.asdict(task) for task in scenario.tasks],
-        "source": source_hash(*RUN_SOURCES, *modules, *suites),
+        "source": source_hash(*RUN_SOURCES, *suites),
     }

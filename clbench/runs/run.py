@@ -24,7 +24,7 @@ from clbench.learning.adaptation import Step
 from clbench.learning.hooks import place_of
 from clbench.learning.optimise import deterministic
 from clbench.learning.pretraining import pretrained_policy
-from clbench.learning.registry import describe_method, method_packages
+from clbench.learning.registry import describe_method
 from clbench.learning.trainer import Trainer, training_inputs
 from clbench.records.paths import stage_folder
 from clbench.records.reader import read_record
@@ -381,5 +381,6 @@ def _inputs(run: ResolvedRun) -> dict[str, Any]:
     return {
         "run": dataclasses.asdict(run.info),
         "scenario": dataclasses.asdict(run.scenario_info),
-        **training_inputs(run.scenario, run.spec.seed, *method_packages(run.method)),
+        "method": describe_method(run.method),
+        **training_inputs(run.scenario, run.spec.seed),
     }

@@ -16,7 +16,6 @@ from clbench.records.paths import label_of, record_path
 from clbench.records.record import RunInfo, ScenarioInfo
 from clbench.runs.tuning import tuned_settings
 from clbench.spec.fields import check_whole
-from clbench.spec.identifiers import without_module
 from clbench.spec.policies import DEFAULT_POLICY, kind_of
 from clbench.spec.protocol import LARGEST_SEED, Protocol, ScoredSplit
 from clbench.spec.registry import load_scenario
@@ -65,15 +64,9 @@ class RunSpec:
         if self.targets is not None:
             check_whole(self, 1, "targets")
 
-    @property
-    def label(self) -> str:
-        """The method with its changed hyper-parameters, for example "experience_replay+replay=0.02"."""
-        return label_of(self.method, self.changes)
-
     def path(self, records: Path) -> Path:
-        """Return the path of the record below the folder `records`."""
-        scenario = without_module(self.scenario)
-        return record_path(records, scenario, self.label, self.seed, self.order, self.policy)
+        """Return the path of the record below the folder `records`; it looks all names up."""
+        return self.resolve().path(records)
 
     def resolve(self) -> ResolvedRun:
         """Return the run with its scenario and its method looked up.

@@ -24,7 +24,7 @@ from clbench.evaluation.checks import Checker
 from clbench.learning.adaptation import Step
 from clbench.learning.hooks import place_of
 from clbench.learning.optimise import MethodError, deterministic
-from clbench.learning.registry import method_packages
+from clbench.learning.registry import describe_method
 from clbench.learning.trainer import STAGE_FILES, Trainer, load_stage, training_inputs
 from clbench.policy.checkpoint import CheckpointError
 from clbench.policy.policy import Policy
@@ -218,7 +218,7 @@ def _kept(run: ResolvedRun, checkpoints: Path) -> Path:
 
 def _made(run: ResolvedRun) -> Path:
     """Return the folder in the cache for policies that this version of the code made again."""
-    code = training_inputs(run.scenario, run.spec.seed, *method_packages(run.method))
+    code = {"method": describe_method(run.method), **training_inputs(run.scenario, run.spec.seed)}
     return cache_folder() / "stages" / hash_of({**_identity(run, 0), **code})
 
 

@@ -147,7 +147,7 @@ def _settings_in(path: Path) -> dict[str, Any]:
     kinds = {"scenario": str, "seeds": list, "methods": dict}
     try:
         content: dict[str, Any] = read_json(path)
-    except (OSError, StrictJSONError) as error:
+    except StrictJSONError as error:
         raise InputError(f"{path} is no file of settings that clbench tune wrote: {error}") from error
     whole = isinstance(content, dict) and all(isinstance(content.get(key), kinds[key]) for key in kinds)
     if not whole:

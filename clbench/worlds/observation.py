@@ -174,7 +174,7 @@ class _DrawingProcess:
 
     def __del__(self) -> None:
         """End the process of an observer that nobody closed."""
-        if not self._complaints.closed:
+        if hasattr(self, "_process") and not self._complaints.closed:  # else it never began
             self.close()
 
 

@@ -291,6 +291,13 @@ def test_a_class_typed_at_a_prompt_has_a_hash() -> None:
     assert result.stdout.strip() == "16"
 
 
+def test_a_script_on_standard_input_has_no_source() -> None:
+    code = "from clbench.base.source import has_source; print(has_source('__main__'))"
+    command = [sys.executable, "-"]
+    result = subprocess.run(command, input=code, capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "False"
+
+
 CLASS = """
 class Some:
     number = {number}

@@ -9,6 +9,7 @@ from clbench.base.cache import cache_folder
 from clbench.cli.main import DEMONSTRATIONS, app
 from clbench.learning import pretraining
 from clbench.spec.registry import load_scenario
+from clbench.spec.scenario import Scenario
 
 TOY = "clbench.testing:clbench/Toy-v0"
 
@@ -31,6 +32,27 @@ def test_a_policy_is_pretrained_unless_it_is_in_the_cache(capsys: pytest.Capture
     times = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
     _clbench("pretrain", TOY)
     assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == times
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        (["--policy-size", "base"], "flow-base"),
+        (["--policy", "discrete_diffusion", "--policy-size", "large"], "discrete_diffusion-large"),
+    ],
+)
+def test_a_policy_of_any_size_is_pretrained(
+    options: list[str], name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = []
+
+    def note(scenario: Scenario, seed: int, progress: object) -> tuple[None, Path]:
+        made.append(scenario.policy)
+        return None, Path("made")
+
+    monkeypatch.setattr("clbench.learning.pretraining.pretrained_policy", note)
+    _clbench("pretrain", TOY, *options)
+    assert made == [name]
 
 
 @pytest.mark.parametrize(

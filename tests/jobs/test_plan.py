@@ -77,6 +77,18 @@ def test_a_pretraining_is_as_long_as_its_steps(tmp_path: Path, empty_caches: Pat
     assert job.length == TINY.budget.pretraining_steps == 10
 
 
+def test_no_two_jobs_of_a_plan_have_one_title_with_a_policy_of_a_class(
+    tmp_path: Path, empty_caches: Path
+) -> None:
+    plan = Plan()
+    for policy in ("flow", "clbench.policy.transformer:TransformerPolicy"):
+        for scenario in (TINY.id, EAGER.id):
+            plan.add_run(RunSpec(scenario, "sft", 0, policy=policy).resolve(), tmp_path)
+    titles = [job.title for job in plan.jobs]
+    assert len(titles) == len(set(titles))
+    assert "me--Tiny-v0+clbench.policy.transformer--TransformerPolicy pretraining seed 0" in titles
+
+
 FAILING = """
 import clbench
 from dataclasses import dataclass

@@ -229,6 +229,33 @@ def test_the_source_of_a_method_covers_the_methods_that_it_derives_from(
     assert method_packages(load_method("derived:Mine")) == ["clbench.methods", "derived"]
 
 
+MIXED = """
+import dataclasses
+import clbench
+
+class Mixin:
+    def scale(self):
+        return {factor}
+
+@dataclasses.dataclass
+class Mine({bases}):
+    def loss(self, policy, batch, progress):
+        return self.scale() * policy.action_loss(batch).mean()
+"""
+
+
+@pytest.mark.parametrize("bases", ["Mixin, clbench.Method", "clbench.Method, Mixin"])
+def test_the_source_of_a_method_typed_at_a_prompt_covers_all_that_it_derives_from(
+    bases: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "__main__", types.ModuleType("__main__"))
+    sources = []
+    for factor in (1.0, 2.0, 2.0):
+        exec(MIXED.format(factor=factor, bases=bases), vars(sys.modules["__main__"]))
+        sources.append(describe_method(load_method("__main__:Mine"))["source"])
+    assert sources[0] != sources[1] == sources[2]
+
+
 BEHIND = {
     "a method that it derives from": "base_of_mine",
     "a module that it imports from beside it": "helper_of_mine",

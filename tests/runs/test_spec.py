@@ -48,6 +48,15 @@ def test_a_resolved_run_has_all_settings_of_its_record() -> None:
     assert run.protocol.target == ("down",)
 
 
+@pytest.mark.parametrize("text", ["0.50", "1.", "5e-1"])
+def test_a_run_by_name_has_the_path_of_its_record_however_a_value_was_typed(
+    text: str, tmp_path: Path
+) -> None:
+    spec = RunSpec(TOY, "sft", 0, {"step_factor": text})
+    place = tmp_path / "Toy-v0" / f"sft+step_factor={float(text)}" / "seed-0.json"
+    assert spec.path(tmp_path) == spec.resolve().path(tmp_path) == place
+
+
 @pytest.mark.parametrize(
     ("spec", "error", "message"),
     [

@@ -7,6 +7,7 @@ import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from clbench.policy.checkpoint import CheckpointError
 from clbench.policy.policy import Policy
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
-from clbench.runs.stages import find_stages, has_stages, keep_stages, load_stages, stage_policies
+from clbench.runs.stages import find_stages, has_stages, keep_stages, load_stages, make_stages, stage_policies
 
 SPEC = RunSpec(TINY.id, "lora", seed=0)
 
@@ -51,6 +52,17 @@ class Restless(Method):
         return (
             policy.action_loss(batch).mean() * noise + (policy.get_parameter("scale") * torch.rand(3)).sum()
         )
+
+
+TYPED = """
+import dataclasses
+import clbench
+
+@dataclasses.dataclass
+class Typed(clbench.Method):
+    def loss(self, policy, batch, progress):
+        return {factor} * policy.action_loss(batch).mean()
+"""
 
 
 @dataclasses.dataclass
@@ -222,3 +234,14 @@ def test_the_error_of_a_failing_method_names_the_stage(stranger: Callable[[type[
         MethodError, match=r"failed in end_task\(\) of stage 1 \(right\): RuntimeError: cannot merge right"
     ):
         stage_policies(RunSpec(TINY.id, stranger(Stumbling), seed=0).resolve())
+
+
+def test_policies_of_a_class_typed_at_a_prompt_are_made_again_if_the_class_has_changed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "__main__", ModuleType("__main__"))
+    folders = []
+    for factor in (1.0, 2.0):
+        exec(TYPED.format(factor=factor), vars(sys.modules["__main__"]))
+        folders.append(make_stages(RunSpec(TINY.id, "__main__:Typed", 0, targets=1).resolve()))
+    assert len(set(folders)) == 2
