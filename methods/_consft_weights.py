@@ -77,7 +77,7 @@ class WeightedSFT(Method, ABC):
         return min(self.tau_start / max(rho, 1e-8), self.tau_end)
 
     def confidence(self, losses: Tensor, progress: Progress) -> Tensor:
-        """Return ConSFT's weights (Eq. 5): the confidence in each sample (B,), from its loss (B,)."""
+        """Return ConSFT's weights (Eq. 4): the confidence in each sample (B,), from its loss (B,)."""
         scale = self.loss_scale * self.kappa / self.temperature(progress)
         confidence = torch.exp(-scale * losses.detach())
         return confidence.clamp(min=self.omega_min)

@@ -104,7 +104,6 @@ Act: TypeAlias = Callable[[Sequence[Live]], NDArray[np.float32]]
 
 def play_in_lanes(
     lanes: Lanes,
-    count: int,
     trials: Sequence[Trial],
     seed: int,
     begin: Callable[[Live], None],
@@ -118,7 +117,6 @@ def play_in_lanes(
 
     Args:
         lanes: Running worlds.
-        count: Number of lanes to use.
         trials: Episodes by task, split and number.
         seed: Seed of the run; it chooses the initial states.
         begin: Called with each episode before its first step.
@@ -131,7 +129,7 @@ def play_in_lanes(
         LeakError: A hook asks for other episodes than validation episodes of tasks that it knows.
     """
     check_episodes((task.name, split) for task, split, _ in trials)
-    queue, idle = list(reversed(trials)), list(range(count))
+    queue, idle = list(reversed(trials)), list(range(lanes.count))
     live: list[Live] = []
     ended: dict[EpisodeKey, Episode] = {}
     certain = False

@@ -245,7 +245,7 @@ def _play(
         one.shown = shown_instruction(one.instruction, instruction, scenario)
 
     with closing(Lanes(count, threads=cores() if count > 1 else 1)) as lanes:
-        return play_in_lanes(lanes, count, trials, seed, begin, partial(act, lanes), progress=progress)
+        return play_in_lanes(lanes, trials, seed, begin, partial(act, lanes), progress=progress)
 
 
 def _observations(lanes: Lanes, live: Sequence[Live]) -> Iterator[Observation]:

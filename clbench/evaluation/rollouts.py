@@ -39,7 +39,6 @@ class Evaluator:
     def __init__(self, scenario: Scenario, seed: int, threads: int = 1, lanes: int = LANES) -> None:
         self.scenario = scenario
         self.seed = seed
-        self._count = lanes
         self._lanes = Lanes(lanes, threads)
 
     def close(self) -> None:
@@ -93,7 +92,6 @@ class Evaluator:
         with evaluating(policy):
             return play_in_lanes(
                 self._lanes,
-                self._count,
                 trials,
                 self.seed,
                 partial(_begin, policy),
@@ -106,7 +104,7 @@ class Evaluator:
     def _act(self, policy: Policy, live: Sequence[Live]) -> NDArray[np.float32]:
         """Return the actions to execute, (len(live), executed, A)."""
         config = policy.config
-        rows = self._count
+        rows = self._lanes.count
         state = torch.zeros(rows, config.state_size)
         words = torch.ones(rows, len(live[0].shown), dtype=torch.int64)
         noise = torch.zeros(rows, config.chunk, config.action_size)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -47,22 +46,6 @@ class Cell(NamedTuple):
         method = f"method {quoted(self.method)}, " if self.method else ""
         seed = f"seed {quoted(self.seed)}, " if self.seed else ""
         return f"{method}{seed}stage {self.stage}, task {quoted(self.task)}"
-
-
-@dataclass(frozen=True)
-class Groups:
-    """The tasks of each group, as the user names them; None stands for the tasks in no other group."""
-
-    retained: Names = ()
-    """Tasks that are known before the first target."""
-    target: Names | None = None
-    """Tasks that are learned, in their order."""
-    held_out: Names = ()
-    """Tasks that are never trained."""
-
-    def __post_init__(self) -> None:
-        for group, names in vars(self).items():
-            object.__setattr__(self, group, None if names is None else _names(names))
 
 
 def _names(names: Names) -> tuple[str, ...]:
@@ -108,8 +91,7 @@ def from_matrix(
     names = _names(tasks) if tasks is not None else tuple(f"task {n}" for n in range(1, columns + 1))
     if len(names) != columns:
         raise InputError(f"There are {counted(len(names), 'name')} for {counted(columns, 'task')}.")
-    groups = Groups(retained, target, held_out)
-    layout = layout_of(names, groups)
+    layout = layout_of(names, retained, target, held_out)
     first = 1 + len(layout.target) - rows
     if first not in (0, 1):
         raise InputError(f"The matrix has {counted(rows, 'row')}. {_expected_stages(layout)}")
@@ -120,7 +102,7 @@ def from_matrix(
         for row in range(rows)
         for column, name in enumerate(names)
     }
-    return measure(matrices_of(cells, names, groups, unit))
+    return measure(matrices_of(cells, layout, unit))
 
 
 def _array(values: ArrayLike, method: str) -> Array:
@@ -151,19 +133,15 @@ def _shape(arrays: Mapping[str, Array]) -> tuple[int, int]:
     return rows, columns
 
 
-def matrices_of(
-    cells: Mapping[Cell, float], tasks: Names, groups: Groups, unit: Unit | None, where: str = ""
-) -> Matrices:
+def matrices_of(cells: Mapping[Cell, float], layout: Layout, unit: Unit | None, where: str = "") -> Matrices:
     """Return the cells of a table as matrices.
 
     Args:
         cells: The success rates that are there, NaN where missing.
-        tasks: Names of all tasks, in the order of the table.
-        groups: The groups of the tasks.
+        layout: Groups and order of the tasks.
         unit: Unit of the rates; None to choose it by the rates.
         where: Place of the table for messages, such as "table.csv: ".
     """
-    layout = layout_of(tasks, groups)
     stages = sorted({cell.stage for cell in cells})
     if not stages or stages[-1] != len(layout.target) or stages[0] < 0:
         found = f"The stages are {stages[0]} to {stages[-1]}." if stages else "The table has no rows."
@@ -179,7 +157,7 @@ def matrices_of(
     for cell, rate in cells.items():
         of_method = success.setdefault(cell.method, {})
         if cell.seed not in of_method:
-            of_method[cell.seed] = np.full((len(layout.target) + 1, len(tasks)), np.nan)
+            of_method[cell.seed] = np.full((len(layout.target) + 1, len(layout.tasks)), np.nan)
         of_method[cell.seed][cell.stage, places[cell.task]] = min(rate / MOST[chosen], 1.0)
     return Matrices(layout, success, chosen, unit is not None, max(known.values(), default=0.0))
 
@@ -221,27 +199,23 @@ def _check_range(known: Mapping[Cell, float], unit: Unit, where: str) -> None:
             raise InputError(f"{where}{cell}: expected {words}, found {rate:g}.")
 
 
-def layout_of(tasks: Names, groups: Groups) -> Layout:
-    """Return the layout of a matrix whose columns are `tasks`."""
-    for task in (*groups.retained, *(groups.target or ()), *groups.held_out):
+def layout_of(
+    tasks: Names, retained: Names = (), target: Names | None = None, held_out: Names = ()
+) -> Layout:
+    """Return the layout of a matrix whose columns are `tasks`; the groups are those of `from_matrix`."""
+    known, never = _names(retained), _names(held_out)
+    rest = tuple(task for task in tasks if task not in (*known, *never))
+    learned = rest if target is None else _names(target)
+    chosen = (*known, *learned, *never)
+    for task in chosen:
         if task not in tasks:
             raise unknown("task", task, tasks)
-    others = {*groups.retained, *groups.held_out}
-    target = groups.target if groups.target is not None else [task for task in tasks if task not in others]
-    chosen = [*groups.retained, *target, *groups.held_out]
     for task in tasks:
         if chosen.count(task) != 1:
             fault = "is in no group" if task not in chosen else "is named twice"
             raise InputError(f"Task {quoted(task)} {fault}: it is retained, a target, or held out.")
     return Layout(
-        tuple(groups.retained),
-        tuple(target),
-        tuple(groups.held_out),
-        episodes=(),
-        curve_episodes=(),
-        validation_episodes=(),
-        steps=(1,),
-        kinds=(),
+        known, learned, never, episodes=(), curve_episodes=(), validation_episodes=(), steps=(1,), kinds=()
     )
 
 

@@ -11,7 +11,7 @@ import functools
 import itertools
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -92,11 +92,11 @@ class Report:
     """What was measured."""
     values: Mapping[str, Mapping[str, Value]]
     """The values of all metrics of the registry, by metric and method."""
-    flips: tuple[Flip, ...] = field(init=False)
-    """Where the order of two methods depends on the definition."""
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "flips", tuple(_flips(self.values)))
+    @functools.cached_property
+    def flips(self) -> tuple[Flip, ...]:
+        """Where the order of two methods depends on the definition."""
+        return tuple(_flips(self.values))
 
     @property
     def unit(self) -> str:

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from clbench.base.errors import InputError
 from clbench.base.text import did_you_mean, quoted
-from clbench.metrics.matrices import Cell, Groups, Names, Unit, matrices_of
+from clbench.metrics.matrices import Cell, Names, Unit, layout_of, matrices_of
 from clbench.metrics.report import Report, measure
 
 EXAMPLES = Path(__file__).parent / "examples"
@@ -103,8 +103,8 @@ def from_csv(
     """
     path = find(path)
     cells, tasks = _read(path)
-    groups = Groups(retained, target, held_out)
-    return measure(matrices_of(cells, tasks, groups, unit, f"{path.name}: "))
+    layout = layout_of(tasks, retained, target, held_out)
+    return measure(matrices_of(cells, layout, unit, f"{path.name}: "))
 
 
 def _text(path: Path) -> str:

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING, TypeAlias
 
 import torch
 import torch.nn.functional as F
@@ -28,35 +28,14 @@ from torch import Tensor
 from clbench.base.errors import InputError
 from clbench.spec.fields import check_share
 
+if TYPE_CHECKING:
+    from clbench.policy.discrete import DiscreteDiffusionHead
+
 EASY_FIRST_STEPS = 12
 """Forwards of easy-first decoding: the number of Discrete Diffusion VLA (arXiv 2508.20072)."""
 
 
-class MaskedHead(Protocol):
-    """What a decoder needs of a head whose chunks have H steps of A tokens."""
-
-    bins: int
-    """Number of ids of a token, K; the id K is the mask."""
-    chunk: int
-    action_size: int
-    length: int
-    """Tokens of a chunk, H * A."""
-    block: int
-    """Steps of a block of block-causal attention; 0 if every token reads all others."""
-
-    def logits(self, tokens: Tensor, hidden: list[Tensor], mask: Tensor) -> Tensor:
-        """Return the logits (B, H * A, K) of all tokens (B, H * A)."""
-
-    def begin(self, hidden: list[Tensor]) -> list[Tensor]:
-        """Return the keys and values of the observation, one (2, B, heads, P, W / heads) per layer."""
-
-    def go_on(
-        self, tokens: Tensor, first: int, keys: list[Tensor], mask: Tensor
-    ) -> tuple[Tensor, list[Tensor]]:
-        """Return the logits (B, n, K) of the tokens from place `first` on, and `keys` with theirs added."""
-
-
-Decoder = Callable[[MaskedHead, list[Tensor], Tensor], Tensor]
+Decoder: TypeAlias = "Callable[[DiscreteDiffusionHead, list[Tensor], Tensor], Tensor]"
 """Maps a head, hidden states of the backbone and the mask (B, 1, 1, P) to the tokens (B, H * A)."""
 
 
@@ -102,7 +81,7 @@ class Work:
 
 
 def easy_first(
-    head: MaskedHead,
+    head: DiscreteDiffusionHead,
     hidden: list[Tensor],
     mask: Tensor,
     steps: int = EASY_FIRST_STEPS,
@@ -127,7 +106,7 @@ def easy_first(
 
 
 def pipelined(
-    head: MaskedHead,
+    head: DiscreteDiffusionHead,
     hidden: list[Tensor],
     mask: Tensor,
     thresholds: Thresholds = Thresholds(),
@@ -179,7 +158,7 @@ def pipelined(
 class Kept:
     """Forwards of one chunk that keep the keys and values of the observation and of complete blocks."""
 
-    def __init__(self, head: MaskedHead, hidden: list[Tensor], mask: Tensor, steps: int) -> None:
+    def __init__(self, head: DiscreteDiffusionHead, hidden: list[Tensor], mask: Tensor, steps: int) -> None:
         self.head, self.mask = head, mask
         self.size = steps * head.action_size
         """Tokens of a block."""
@@ -202,7 +181,12 @@ class Blocks:
     """The state of the pipeline for B chunks of N blocks: their tokens, and which blocks have begun."""
 
     def __init__(
-        self, head: MaskedHead, batch: int, steps: int, thresholds: Thresholds, device: torch.device
+        self,
+        head: DiscreteDiffusionHead,
+        batch: int,
+        steps: int,
+        thresholds: Thresholds,
+        device: torch.device,
     ) -> None:
         self.bins, self.thresholds = head.bins, thresholds
         count = head.chunk // steps

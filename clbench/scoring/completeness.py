@@ -7,12 +7,12 @@ from collections.abc import Iterable, Sequence
 
 from clbench.records.reader import RecordError
 from clbench.records.record import Record
-from clbench.scoring.reading import ScoredEpisode
+from clbench.scoring.reading import EpisodeRow
 from clbench.spec.policies import is_built_in
 from clbench.spec.protocol import EpisodeKey, Point, Protocol
 
 
-def check_complete(record: Record, rows: Iterable[ScoredEpisode], protocol: Protocol) -> None:
+def check_complete(record: Record, rows: Iterable[EpisodeRow], protocol: Protocol) -> None:
     """Refuse a record that is not what its budget demands: results that are left out change the scores.
 
     A method of whole stages, and a policy that was trained elsewhere, is evaluated at the ends of stages
@@ -54,11 +54,11 @@ def _check_answers(record: Record, points: Sequence[Point], demanded: int) -> No
         raise RecordError(f"answers: {total:,} questions were asked, not {demanded:,}.")
 
 
-def _check_episodes(rows: Iterable[ScoredEpisode], protocol: Protocol) -> Sequence[Point]:
+def _check_episodes(rows: Iterable[EpisodeRow], protocol: Protocol) -> Sequence[Point]:
     """Check the episodes, and return the points at which the policy was evaluated, in their order."""
     played: dict[Point, set[EpisodeKey]] = defaultdict(set)
     for row in rows:
-        played[row.point].add(EpisodeKey(row.task, row.split, row.episode))  # type: ignore[arg-type]
+        played[row.point].add(EpisodeKey(row.task, row.split, row.episode))
     ends = [protocol.end(stage) for stage in protocol.stages]
     every = [point for stage in protocol.stages for point in protocol.points(stage)]
     expected = ends if set(played) <= set(ends) else every

@@ -40,7 +40,7 @@ from clbench.base.errors import InputError
 from clbench.scoring.layout import Array
 from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import load_metric
-from clbench.scoring.rates import Rates, check_same, combine
+from clbench.scoring.rates import Rates, check_same, stacked
 from clbench.scoring.scores import Scores, rates_of
 
 Runs = Mapping[int, Scores]
@@ -389,7 +389,7 @@ class _Samples:
     def _drawn(self, runs: Sequence[Scores], counts: Array) -> Rates:
         """Return the rates of `runs` over `counts` of the episodes, (replicates, runs, tasks, episodes)."""
         parts = [run.rates(counts[:, number]) for number, run in enumerate(runs)]
-        rates = combine(parts, lambda arrays: np.stack(arrays, axis=1))
+        rates = stacked(parts, axis=1)
         share = rates.correct / np.maximum(rates.asked, 1)
         correct = self.generator.binomial(rates.asked.astype(np.int64), share)
         of_runs = {name: np.full_like(getattr(rates, name), np.nan) for name in OF_WHOLE_RUNS}

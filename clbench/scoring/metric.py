@@ -21,8 +21,47 @@ DIFFERENCE = "difference of success rates"
 """Unit of a metric that takes success rates from each other."""
 
 
-@dataclass(frozen=True)
-class Metric:
+@dataclass(frozen=True, kw_only=True)
+class Facts:
+    """What a metric states about itself. As a decorator, it enters a function into the registry.
+
+    The metric has the name of the function, and the first line of its docstring as its description.
+    """
+
+    formula: str
+    """Formula, in words and in the letters of `clbench.scoring.ours`."""
+    source: str
+    """Paper or convention that defines it."""
+    missing: str
+    """Condition under which it has no value, in one sentence."""
+    low: float = 0.0
+    """Least possible value."""
+    high: float = 1.0
+    """Greatest possible value."""
+    higher_is_better: bool | None = True
+    """None if neither is better."""
+    units: str = "success rate"
+    """Unit of the value."""
+    references: tuple[str, ...] = ()
+    """Methods whose records of the same seeds it needs."""
+    compares_itself: bool = False
+    """Whether a reference method has a value too, compared with itself."""
+    pooled: bool = False
+    """Whether the rates are averaged over seeds first; if not, the value is the mean of the seeds' values."""
+    ratio: bool = False
+    """Whether the value is a positive ratio: its mean over seeds is geometric, and so is its interval."""
+    version: int = 0
+    """Number of the definition."""
+
+    def __call__(self, function: Function) -> Function:
+        """Register a function."""
+        name, description = function.__name__, (function.__doc__ or "").partition("\n")[0]
+        REGISTRY[name] = Metric(name=name, function=function, description=description, **vars(self))
+        return function
+
+
+@dataclass(frozen=True, kw_only=True)
+class Metric(Facts):
     """A named, versioned definition of one number. A changed definition is a new version."""
 
     name: str
@@ -31,30 +70,6 @@ class Metric:
     """Maps rates with batch axes (...) to values (...), NaN where something is missing."""
     description: str
     """Meaning in one sentence."""
-    formula: str
-    """Formula, in words and in the letters of `clbench.scoring.ours`."""
-    source: str
-    """Paper or convention that defines it."""
-    low: float
-    """Least possible value."""
-    high: float
-    """Greatest possible value."""
-    higher_is_better: bool | None
-    """None if neither is better."""
-    units: str
-    """Unit of the value."""
-    missing: str
-    """Condition under which it has no value, in one sentence."""
-    references: tuple[str, ...]
-    """Methods whose records of the same seeds it needs."""
-    compares_itself: bool
-    """Whether a reference method has a value too, compared with itself."""
-    pooled: bool
-    """Whether the rates are averaged over seeds first; if not, the value is the mean of the seeds' values."""
-    ratio: bool
-    """Whether the value is a positive ratio: its mean over seeds is geometric, and so is its interval."""
-    version: int
-    """Number of the definition."""
 
     def over_runs(self, rates: Rates) -> Array:
         """Return the value (...) over the runs of `rates`, whose last batch axis is the run: (..., runs)."""
@@ -76,45 +91,5 @@ class Metric:
 REGISTRY: dict[str, Metric] = {}
 """Metrics by name, in the order of their definition: those whose module was imported."""
 
-
-def metric(
-    *,
-    formula: str,
-    source: str,
-    missing: str,
-    low: float = 0.0,
-    high: float = 1.0,
-    higher_is_better: bool | None = True,
-    units: str = "success rate",
-    references: tuple[str, ...] = (),
-    compares_itself: bool = False,
-    pooled: bool = False,
-    ratio: bool = False,
-    version: int = 0,
-) -> Callable[[Function], Function]:
-    """Return a decorator that registers a function as a metric, with its name and its docstring's first line.
-
-    The arguments are the fields of `Metric`.
-    """
-
-    def enter(function: Function) -> Function:
-        REGISTRY[function.__name__] = Metric(
-            name=function.__name__,
-            function=function,
-            description=(function.__doc__ or "").partition("\n")[0],
-            formula=formula,
-            source=source,
-            low=low,
-            high=high,
-            higher_is_better=higher_is_better,
-            units=units,
-            missing=missing,
-            references=references,
-            compares_itself=compares_itself,
-            pooled=pooled,
-            ratio=ratio,
-            version=version,
-        )
-        return function
-
-    return enter
+metric = Facts
+"""Decorator of the function of a metric: `@metric(formula=..., source=..., missing=...)`."""

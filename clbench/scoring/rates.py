@@ -121,14 +121,11 @@ class Rates(Measured):
         return self.each(lambda array: np.mean(array, axis=axis))
 
 
-def combine(rates: Sequence[Rates], join: Callable[[Sequence[Array]], Array]) -> Rates:
-    """Return the arrays of several rates, put together by `join`, as one; references stay behind.
-
-    Raises:
-        InputError: The layouts differ.
-    """
-    check_same(part.layout for part in rates)
-    joined: dict[str, Any] = {name: join([getattr(part, name) for part in rates]) for name in _arrays(Rates)}
+def stacked(rates: Sequence[Rates], axis: int = 0) -> Rates:
+    """Return rates of one layout as one, along a new batch axis; references stay behind."""
+    joined: dict[str, Any] = {
+        name: np.stack([getattr(part, name) for part in rates], axis) for name in _arrays(Rates)
+    }
     return Rates(layout=rates[0].layout, **joined)
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from clbench.records.reader import RecordError
-from clbench.records.record import EPISODE_COLUMNS, FARTHEST, CheckRow, Record
+from clbench.records.record import FARTHEST, CheckRow, EpisodeRow, Record
 from clbench.scoring.layout import Array
 from clbench.spec.protocol import SPLITS, Point, Protocol, check_steps
 
@@ -25,18 +25,6 @@ Fetch-v1 has 240, a sequence of 40 targets among 50 tasks 8,200."""
 
 _HIGHEST = {"update_sparsity": 1.0, "activation_drift": FARTHEST, "shift": FARTHEST, "captured": 1.0}
 """Greatest possible value of each change of the policy, in the order of the columns."""
-
-
-class ScoredEpisode(NamedTuple):
-    """An evaluation episode."""
-
-    point: Point
-    task: str
-    split: str
-    episode: int
-    """Number of the initial state."""
-    success: float
-    """0 or 1."""
 
 
 def read_protocol(record: Record) -> Protocol:
@@ -189,39 +177,36 @@ class _Points:
         return point
 
 
-def read_episodes(record: Record, protocol: Protocol) -> list[ScoredEpisode]:
+def read_episodes(record: Record, protocol: Protocol) -> list[EpisodeRow]:
     """Return all episodes of a record, each checked.
 
     Raises:
         RecordError: An episode is impossible, occurs twice, or is of another kind of run.
     """
-    rows, known, points = [], set(protocol.tasks), _Points(protocol)
-    columns = (record.episodes[name] for name in EPISODE_COLUMNS)
-    for number, values in enumerate(zip(*columns, strict=True)):
-        stage, step, task, split, episode, success, total_reward, length = values
+    rows, known, points = record.episode_rows(), set(protocol.tasks), _Points(protocol)
+    for number, row in enumerate(rows):
         where = f"episodes: row {number}"
-        point = points.check(where, stage, step)
-        if type(episode) is not int or not 0 <= episode <= MOST:
+        points.check(where, row.stage, row.step)
+        if type(row.episode) is not int or not 0 <= row.episode <= MOST:
             raise RecordError(f"{where} has an impossible number of an episode.")
-        if not isinstance(task, str) or task not in known:
-            raise RecordError(f"{where} is of a task that is not in the scenario: {task!r}.")
-        if split not in SPLITS:
-            raise RecordError(f"{where} has the split {split!r}, which is none of {', '.join(SPLITS)}.")
-        if success not in (0, 1):
-            raise RecordError(f"{where} has the success {success!r}, neither true nor false.")
-        if total_reward is not None and not _is_number(total_reward, FARTHEST, -FARTHEST):
+        if not isinstance(row.task, str) or row.task not in known:
+            raise RecordError(f"{where} is of a task that is not in the scenario: {row.task!r}.")
+        if row.split not in SPLITS:
+            raise RecordError(f"{where} has the split {row.split!r}, which is none of {', '.join(SPLITS)}.")
+        if row.success not in (0, 1):
+            raise RecordError(f"{where} has the success {row.success!r}, neither true nor false.")
+        if row.total_reward is not None and not _is_number(row.total_reward, FARTHEST, -FARTHEST):
             raise RecordError(f"{where} has an impossible return.")
-        if type(length) is not int or not 0 <= length <= MOST:
+        if type(row.length) is not int or not 0 <= row.length <= MOST:
             raise RecordError(f"{where} has an impossible length.")
-        rows.append(ScoredEpisode(point, task, split, episode, float(success)))
-    if len({row[:4] for row in rows}) != len(rows):
+    if len({row[:5] for row in rows}) != len(rows):
         raise RecordError("episodes: an episode is there twice.")
     _check_kinds(protocol, rows)
     check_cells("tasks x episodes", len(protocol.tasks), len(numbers(rows)))
     return rows
 
 
-def _check_kinds(protocol: Protocol, rows: Iterable[ScoredEpisode]) -> None:
+def _check_kinds(protocol: Protocol, rows: Iterable[EpisodeRow]) -> None:
     """Refuse a record without scored episodes, or with episodes that its kind of run does not have."""
     splits = {row.split for row in rows}
     if protocol.split not in splits:
@@ -233,8 +218,8 @@ def _check_kinds(protocol: Protocol, rows: Iterable[ScoredEpisode]) -> None:
 
 
 def read_perturbed(
-    protocol: Protocol, rows: Iterable[ScoredEpisode], episodes: Iterable[int]
-) -> list[ScoredEpisode]:
+    protocol: Protocol, rows: Iterable[EpisodeRow], episodes: Iterable[int]
+) -> list[EpisodeRow]:
     """Return the perturbed episodes among `rows`: all that the protocol demands, and no other.
 
     Args:
@@ -262,7 +247,7 @@ def read_perturbed(
     return found
 
 
-def numbers(rows: Iterable[ScoredEpisode]) -> tuple[int, ...]:
+def numbers(rows: Iterable[EpisodeRow]) -> tuple[int, ...]:
     """Return the numbers of the episodes among `rows`, rising."""
     return tuple(sorted({row.episode for row in rows}))
 

@@ -12,9 +12,9 @@ import numpy as np
 from clbench.records.record import Record
 from clbench.scoring.completeness import check_complete
 from clbench.scoring.layout import Array, Layout
-from clbench.scoring.rates import MEASURED, Measured, Rates, check_same, combine
+from clbench.scoring.rates import MEASURED, Measured, Rates, check_same, stacked
 from clbench.scoring.reading import (
-    ScoredEpisode,
+    EpisodeRow,
     numbers,
     place,
     read_answers,
@@ -87,7 +87,7 @@ class Scores(Measured):
         )
         # one table for all points, with a place for the pretrained policy's; the end is the last point
         success = _success(protocol, scored, layout)
-        perturbed = _perturbed(read_perturbed(protocol, rows, episodes), layout)
+        perturbed = _success(protocol, read_perturbed(protocol, rows, episodes), layout)[:, -1]
         in_curves = [episodes.index(number) for number in layout.curve_episodes]
         steps, met = read_checks(record, protocol)
         return cls(
@@ -148,7 +148,7 @@ class Scores(Measured):
         )
 
 
-def _chosen_on(rows: Sequence[ScoredEpisode], protocol: Protocol) -> list[ScoredEpisode]:
+def _chosen_on(rows: Sequence[EpisodeRow], protocol: Protocol) -> list[EpisodeRow]:
     """Return the validation episodes of each stage's target, which choices may look at."""
     own = [row for row in rows if row.split == "validation" and row.point.stage > 0]
     return [row for row in own if row.task == protocol.target[row.point.stage - 1]]
@@ -176,23 +176,14 @@ def _places(names: Sequence[Any]) -> dict[Any, int]:
     return {name: place for place, name in enumerate(names)}
 
 
-def _success(protocol: Protocol, rows: Sequence[ScoredEpisode], layout: Layout) -> Array:
-    """Return the success in scored episodes, (stages + 1, points, tasks, episodes)."""
+def _success(protocol: Protocol, rows: Sequence[EpisodeRow], layout: Layout) -> Array:
+    """Return the success in episodes, (stages + 1, points, tasks, episodes); an end has the last point."""
     shape = len(protocol.stages), len(protocol.steps), len(layout.tasks), len(layout.episodes)
     found = np.full(shape, np.nan)
     of_task, of_episode = _places(layout.tasks), _places(layout.episodes)
     for row in rows:
         where = row.point.stage, place(protocol, row.point), of_task[row.task], of_episode[row.episode]
         found[where] = row.success
-    return found
-
-
-def _perturbed(rows: Sequence[ScoredEpisode], layout: Layout) -> Array:
-    """Return the success in perturbed episodes, (stages + 1, tasks, episodes)."""
-    found = np.full((len(layout.target) + 1, len(layout.tasks), len(layout.episodes)), np.nan)
-    of_task, of_episode = _places(layout.tasks), _places(layout.episodes)
-    for row in rows:
-        found[row.point.stage, of_task[row.task], of_episode[row.episode]] = row.success
     return found
 
 
@@ -213,5 +204,5 @@ def rates_of(runs: Sequence[Scores], references: Mapping[str, Sequence[Scores]])
         InputError: The layouts differ.
     """
     check_same(run.layout for run in (*runs, *chain.from_iterable(references.values())))
-    rates = combine([run.rates() for run in runs], np.stack)
-    return replace(rates, references={name: rates_of(them, {}) for name, them in references.items()})
+    found = {name: stacked([run.rates() for run in them]) for name, them in references.items()}
+    return replace(stacked([run.rates() for run in runs]), references=found)

@@ -6,11 +6,10 @@ A name is a built-in kind, such as "flow", with a size other than the smallest a
 
 from __future__ import annotations
 
-import re
-
-from clbench.base.entry_points import unknown
+from clbench.base.entry_points import is_entry_point, unknown
 from clbench.base.errors import InputError, WrongTypeError
 from clbench.base.source import package_of
+from clbench.spec.identifiers import LONGEST
 
 POLICIES = {
     "flow": "flow matching: noise flows to a chunk of actions (pi0)",
@@ -25,9 +24,6 @@ SIZES: dict[str, tuple[int, int] | None] = {"small": None, "base": (256, 4), "la
 parameters on Fetch-v1, where base has 5 and large 40 million."""
 
 SMALL = "small"
-
-_CLASS = re.compile(r"(?:[A-Za-z_]\w*\.)*[A-Za-z_]\w*:[A-Za-z_]\w*", re.ASCII)
-_LONGEST = 100
 
 
 def policy_names() -> list[str]:
@@ -73,7 +69,8 @@ def check_policy_name(name: str) -> None:
     """
     if not isinstance(name, str):
         raise WrongTypeError(f"A policy is given by a name, such as 'module:Class', not by {name!r}.")
-    if name not in policy_names() and not (len(name) <= _LONGEST and _CLASS.fullmatch(name)):
+    is_class = len(name) <= LONGEST and name.isascii() and is_entry_point(name)
+    if name not in policy_names() and not is_class:
         raise unknown("policy", name, [*policy_names(), "module:Class"])
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, get_args
@@ -174,7 +173,7 @@ class Scenario:
         for part in parts:
             if any(task == member.name for member in getattr(self, part)):
                 return part
-        raise self._unknown(task, self.tasks + self.background)
+        raise self._unknown(task)
 
     def task(self, name: str) -> Task:
         """Return the task called `name`.
@@ -182,14 +181,13 @@ class Scenario:
         Raises:
             UnknownNameError: No task has this name; the nearest one is named.
         """
-        every = self.tasks + self.background
-        for task in every:
+        for task in self.tasks + self.background:
             if task.name == name:
                 return task
-        raise self._unknown(name, every)
+        raise self._unknown(name)
 
-    def _unknown(self, name: str, known: Iterable[Task]) -> UnknownNameError:
-        return unknown(f"task of {self.id}", name, (task.name for task in known))
+    def _unknown(self, name: str) -> UnknownNameError:
+        return unknown(f"task of {self.id}", name, (task.name for task in self.tasks + self.background))
 
 
 def balanced_order(count: int, seed: int) -> tuple[int, ...]:

@@ -108,7 +108,9 @@ class Lanes:
     """
 
     def __init__(self, count: int, threads: int = 1) -> None:
-        self._count, self._threads = count, threads
+        self.count = count
+        """Number of lanes."""
+        self._threads = threads
         self._worlds: dict[tuple[str, bool], VectorWorld] = {}
         self._observers: dict[tuple[str, str] | None, Observer] = {}
         self._home: list[VectorWorld | None] = [None] * count
@@ -118,7 +120,7 @@ class Lanes:
         """Return the vector world of a task, or its perturbed twin, which is made on first use."""
         key = task.world, perturbed
         if key not in self._worlds:
-            self._worlds[key] = vector_world(task.world, self._count, self._threads, perturbed)
+            self._worlds[key] = vector_world(task.world, self.count, self._threads, perturbed)
         return self._worlds[key]
 
     def observer(self, task: Task) -> Observer:
@@ -198,7 +200,7 @@ class Lanes:
             observer.close()
         self._worlds.clear()
         self._observers.clear()
-        self._home = [None] * self._count
+        self._home = [None] * self.count
 
     def _empty(self, lanes: Sequence[int]) -> States:
         """Return uninitialised memory for the states of `lanes`, each of which must have an episode."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import statistics
 from collections.abc import Sequence
 from typing import Any
 
@@ -23,7 +23,7 @@ def step_ratio(run: Run) -> float | None:
 def mean_step_ratio(runs: Sequence[Run]) -> float | None:
     """Return the mean of `step_ratio` over the runs that measured it, None without one."""
     times = [ratio for run in runs if (ratio := step_ratio(run)) is not None]
-    return math.fsum(times) / len(times) if times else None
+    return statistics.fmean(times) if times else None
 
 
 def costs_of(runs: Sequence[Run], baseline: Sequence[Run]) -> dict[str, float | None]:
@@ -54,5 +54,5 @@ def costs_of(runs: Sequence[Run], baseline: Sequence[Run]) -> dict[str, float | 
 def _mean(runs: Sequence[Run], name: str) -> float | None:
     """Return the mean of a cost over runs, None if a run does not state it."""
     values = [getattr(run.record.costs, name) for run in runs]
-    numbers = [value for value in values if value is not None and is_number(value)]
-    return math.fsum(numbers) / len(numbers) if numbers and len(numbers) == len(values) else None
+    numbers = [value for value in values if is_number(value)]
+    return statistics.fmean(numbers) if numbers and len(numbers) == len(values) else None

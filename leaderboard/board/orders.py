@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import statistics
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -60,4 +60,4 @@ def orders_of(runs: Iterable[Run]) -> Orders:
 def _final_average(runs: list[Run]) -> float | None:
     values = [measure("final_average", run.scores) for run in runs]
     known = [value for value in values if value is not None]
-    return math.fsum(known) / len(known) if known and len(known) == len(values) else None
+    return statistics.fmean(known) if known and len(known) == len(values) else None

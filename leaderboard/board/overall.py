@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -76,7 +77,7 @@ def mean_estimate(parts: Sequence[Estimate]) -> Estimate:
     values = [one.value for one in parts if one.value is not None]
     if not values or len(values) < len(parts):
         return NO_ESTIMATE
-    mean = math.fsum(values) / len(values)
+    mean = statistics.fmean(values)
     low = [one.value - one.low for one in parts if one.value is not None and one.low is not None]
     high = [one.high - one.value for one in parts if one.value is not None and one.high is not None]
     if len(low) < len(parts) or len(high) < len(parts):

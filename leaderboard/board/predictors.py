@@ -2,49 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from clbench.scoring.layout import Array
-from clbench.scoring.metrics import measure
-from clbench.scoring.scores import Scores
-from clbench.spec.references import BASELINE
 
 from .agreement import LEAST_ROWS, LEAST_SEEDS, REPLICATES, Agreement, kendall_tau
-from .rows import Row
-from .summary import METHODS
+from .rows import Row, values_by_seed
 
-Quantity = Callable[[Scores], float | None]
-
-
-def _metric(name: str) -> Quantity:
-    return lambda scores: measure(name, scores)
-
-
-def _less(name: str) -> Quantity:
-    """Return 1 minus a metric."""
-
-    def quantity(scores: Scores) -> float | None:
-        value = measure(name, scores)
-        return None if value is None else 1.0 - value
-
-    return quantity
-
-
-PREDICTORS: dict[str, Quantity] = {
-    "the shift of the policy on the new data": _metric("shift"),
-    "the share of the weights that changed": _less("update_sparsity"),
-    "activation drift": _metric("activation_drift"),
+PREDICTORS = {
+    "the shift of the policy on the new data": ("shift", 1.0),
+    "the share of the weights that changed": ("update_sparsity", -1.0),
+    "activation drift": ("activation_drift", 1.0),
 }
-"""Quantities of a run that may predict what it forgets, by their names in a sentence."""
+"""Metrics that may predict what a run forgets, and whether they rise or fall with it, by their names in a
+sentence."""
 
 BOARDS = 10_000
 """Boards of equal methods that say how large a tau is by chance; no p is below 0.0001."""
-
-LOST = _less("kept_share")
-"""Share of what was known before a stage that is lost at its end, mean over the stages."""
 
 
 @dataclass(frozen=True)
@@ -60,17 +37,15 @@ def predictions(rows: Iterable[Row]) -> list[Prediction]:
 
     The seeds are the baseline's. A row without one of them, or without a value, is left out.
     """
-    competing = [row for row in rows if row.division in METHODS and row.to_criterion]
-    seeds = next((row.seeds for row in competing if row.method == BASELINE), ())
-    whole = [row for row in competing if set(row.seeds).issuperset(seeds)]
+    to_criterion = [row for row in rows if row.to_criterion]
+    kept = values_by_seed(to_criterion, "kept_share")
     found = []
-    for name, quantity in PREDICTORS.items():
-        pairs = [[[quantity(row.scores[seed]), LOST(row.scores[seed])] for seed in seeds] for row in whole]
-        known = [pair for pair in pairs if all(None not in values for values in pair)]
-        if len(known) >= LEAST_ROWS and len(seeds) >= LEAST_SEEDS:
-            prediction = prediction_of(name, np.array(known, dtype=float))
-            found += [prediction] if prediction else []
-    return found
+    for name, (metric, sign) in PREDICTORS.items():
+        values = values_by_seed(to_criterion, metric)
+        pairs = np.array([np.transpose([values[one], kept[one]]) for one in values if one in kept])
+        if len(pairs) >= LEAST_ROWS and pairs.shape[1] >= LEAST_SEEDS:
+            found.append(prediction_of(name, pairs * (sign, -1.0)))
+    return [one for one in found if one is not None]
 
 
 def prediction_of(name: str, values: Array, replicates: int = REPLICATES) -> Prediction | None:

@@ -6,6 +6,7 @@ They are made from the records alone.
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, groupby
@@ -190,7 +191,7 @@ def pretrained_success(rows: Iterable[Row]) -> float | None:
         return None
     rates = [run.record.retained_at_start() for run in row.runs]
     known = [rate for rate in rates if rate is not None]
-    return math.fsum(known) / len(known) if known else None
+    return statistics.fmean(known) if known else None
 
 
 def mean_difference(metric: str, runs: Runs, others: Runs) -> float | None:
@@ -206,7 +207,7 @@ def mean_difference(metric: str, runs: Runs, others: Runs) -> float | None:
         for seed in sorted(runs.keys() & others.keys())
     ]
     differences = [one - other for one, other in pairs if one is not None and other is not None]
-    return math.fsum(differences) / len(differences) if differences else None
+    return statistics.fmean(differences) if differences else None
 
 
 def _heights(

@@ -6,6 +6,7 @@ before plain fine-tuning has forgotten any answer.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from clbench.base.text import counted
@@ -113,6 +114,7 @@ def stop_gradient_keeps_and_wastes(evidence: Evidence) -> Finding:
     of_sft = question_drop(evidence, "sft")
     if loses_no_answers(of_sft):
         return Finding("cannot be shown here", (early, answers), (of_sft,), (NOTHING_TO_KEEP,), LOSES_ANSWERS)
+    by_answers = answers.low > 0.01 or early.high < -0.05
     return Finding(
         decided(
             holds=answers.high < 0.01 and early.high < -0.05,
@@ -121,7 +123,7 @@ def stop_gradient_keeps_and_wastes(evidence: Evidence) -> Finding:
         (early, answers),
         (of_sft,),
         (),
-        what_would_change(*((early, -0.05) if is_open(early, -0.05) else (answers, 0.01))),
+        what_would_change(*((answers, 0.01) if by_answers else (early, -0.05))),
     )
 
 
@@ -159,8 +161,20 @@ def lora_still_overwrites(evidence: Evidence) -> Finding:
             "The direction of the update was not measured.",
             *_when_lost(evidence, "lora"),
         ),
-        what_would_change(max(answers, key=lambda one: one.high) if all(lost) else answers[1], -0.01),
+        what_would_change(*_deciding_rank(answers, skills)),
     )
+
+
+def _deciding_rank(answers: Sequence[Figure], skills: Sequence[Figure]) -> tuple[Figure, float]:
+    """Return the figure that would first change the verdict on LoRA, and its bar."""
+    kept = [one for one in answers if not one.high < -0.01]
+    if not kept:
+        return max(answers, key=lambda one: one.high), -0.01
+    bars = [(one, -0.01) for one in kept]
+    if len(kept) == len(answers):  # else skills no longer matter
+        bars += [(one, -0.05) for one in skills]
+    nearest = min(kept, key=lambda one: one.low), -0.01
+    return next((pair for pair in bars if is_open(*pair)), nearest)
 
 
 @claim(
@@ -248,7 +262,7 @@ def _seeds_below(evidence: Evidence) -> tuple[str, ...]:
 
 
 def _of_stages(evidence: Evidence, name: str, what: str, stage: int | None = None) -> Figure:
-    return evidence.diagnostic("aegis", what, lambda found: found.get(name), ".2%", stage, SHARE)
+    return evidence.diagnostic("aegis", what, name, SHARE, ".2%", stage)
 
 
 @claim(
@@ -291,5 +305,5 @@ def costs_40_percent(evidence: Evidence) -> Finding:
     return Finding(
         decided(holds=time.high <= 1.6 and not buffer, fails=time.low > 1.6 or buffer),
         (time, evidence.cost("bytes_kept", "aegis", "bytes kept of aegis, the anchor")),
-        change=what_would_change(time, 1.6),
+        change="Runs whose stages read no prior data." if buffer else what_would_change(time, 1.6),
     )

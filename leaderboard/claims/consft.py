@@ -190,7 +190,7 @@ def as_good_as_replay(evidence: Evidence) -> Finding:
     verdict = _reaches(arms, every.values())
     holding = [arm[0].methods[0] for arm in arms if all(figure.low >= -0.05 for figure in arm)]
     others = [figure for arm in ARMS if arm not in counting for figure in every[arm]]
-    deciders = arms if verdict == "holds" else every.values()
+    worst = {arm: min(figures, key=lambda one: one.high) for arm, figures in every.items()}
     sentences = [f"It holds for {' and '.join(holding)}."] if holding else []
     if verdict == "does not hold":
         names = " and ".join(arm[0].methods[0] for arm in arms)
@@ -200,7 +200,9 @@ def as_good_as_replay(evidence: Evidence) -> Finding:
         best_first([arm[0] for arm in arms]),
         (*(arm[1] for arm in arms), *others),
         (*inactive_sentences(evidence), *if_all_counted(counting, verdict, of_all), *sentences),
-        what_would_change(best_first([arm[0] for arm in deciders])[0], -0.05),
+        what_would_change(
+            deciding_arm(verdict, [worst[arm] for arm in counting], worst.values(), -0.05), -0.05
+        ),
         about=ARMS,
     )
 
@@ -335,5 +337,5 @@ def costs_nothing(evidence: Evidence) -> Finding:
         (time, bytes_kept, added),
         (bytes_of_sft, added_by_sft),
         (),
-        what_would_change(time, 1.05),
+        "Runs that keep, add and read no more than sft." if more else what_would_change(time, 1.05),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -169,35 +170,35 @@ class Evidence:
 
     # ---- figures of costs and diagnostics ----------------------------------------------------------
 
-    def cost(self, name: str, method: str, what: str, form: str = ",.0f") -> Figure:
+    def cost(self, name: str, method: str, what: str) -> Figure:
         """Return the mean of a cost over seeds."""
-        return self._mean_of(method, what, lambda run: [getattr(run.record.costs, name)], form)
+        return self._mean_of(method, what, lambda run: [getattr(run.record.costs, name)], ",.0f")
 
     def diagnostic(
         self,
         method: str,
         what: str,
-        read: Callable[[Mapping[str, Any]], Any],
+        name: str,
+        span: Span,
         form: str = ".2f",
         stage: int | None = None,
-        span: Span = UNBOUNDED,
     ) -> Figure:
         """Return the mean of a diagnostic over stages and seeds, with its interval over seeds.
 
         Args:
             method: Label of the method.
             what: Name of the figure.
-            read: Returns the value from the diagnostics of a stage; None if they do not have it.
+            name: Name of the diagnostic. A stage without it does not count.
+            span: Least and greatest possible value.
             form: Format of the number.
             stage: The only stage that counts; all count if None.
-            span: Least and greatest possible value.
         """
 
         def values(run: Run) -> list[Any]:
             of_stages = run.record.diagnostics.items()
-            chosen = [found for name, found in of_stages if stage is None or name == str(stage)]
-            read_ones = [read(found) for found in chosen if isinstance(found, dict)]
-            return [value for value in read_ones if value is not None]
+            chosen = [found for number, found in of_stages if stage is None or number == str(stage)]
+            known = [found.get(name) for found in chosen if isinstance(found, dict)]
+            return [value for value in known if value is not None]
 
         return self._mean_of(method, what, values, form, span)
 
@@ -252,7 +253,7 @@ def number_mean(values: Sequence[Any]) -> float:
     """Return the mean of `values`, NaN if there are none or one is not a usable number."""
     if not values or not all(is_number(value) for value in values):
         return math.nan
-    return math.fsum(values) / len(values)
+    return statistics.fmean(values)
 
 
 def _start_of(run: Run) -> datetime | None:

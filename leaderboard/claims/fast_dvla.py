@@ -11,7 +11,7 @@ import math
 from clbench.scoring.intervals import NO_ESTIMATE, Estimate
 
 from ..policies.decoders import Decoding, read_decoding
-from .claim import ANYWHERE, Finding, Paper, claim, decided, is_open, what_would_change
+from .claim import ANYWHERE, Finding, Paper, claim, decided, what_would_change
 from .evidence import Evidence, Figure, rung
 from .figures import PUBLISHED, loses_no_answers, median_stage, question_drop, share_of_steps
 
@@ -121,7 +121,7 @@ def vector_carries_the_capability(evidence: Evidence) -> Finding:
     """The difference of two short trainings is a vector; merged, it replaces the auxiliary objective."""
     over_sft, over_random = _of_the_vector(evidence)
     controls = (over_random, share_of_steps(evidence, CO_TRAINING, SFT))
-    random_decides = is_open(over_random, 0.95) and not is_open(over_sft, 0.95)
+    random_decides = over_sft.high < 0.95 or over_random.low > 0.95
     if not_shown := _not_shown(evidence, over_sft, *controls):
         return not_shown
     return Finding(

@@ -27,7 +27,7 @@ from ..claims.judges import Judged
 from ..policies.compared import by_table
 from ..views.format import MISSING, format_interval, tau_text
 from ..views.markdown import templates
-from ..views.page.charts.picture import themed
+from ..views.page.charts.picture import in_both_themes
 from .agreements import after_correction, agreement_sentences, without_demonstrations
 from .findings_chart import gains_chart
 from .gains import Tied, competing, gain_sentences, gain_table
@@ -68,8 +68,7 @@ def pictures(board: Board) -> dict[str, str]:
     rows = {name: competing(rows) for name, rows in _boards(board).items()}
     if not any(rows.values()):
         return {}
-    chart = gains_chart(rows)
-    return {f"gains{'-dark' if dark else ''}.svg": themed(chart, dark).svg() for dark in (False, True)}
+    return in_both_themes("gains", gains_chart(rows))
 
 
 def sections(board: Board, judged: Sequence[Judged], evidence: Callable[[str], Evidence]) -> list[Section]:

@@ -141,10 +141,7 @@ def _diagnostics(method: Description, sources: Sources) -> dict[str, Estimate]:
 
 def _mean_diagnostic(method: str, name: str, sources: Sources) -> Estimate:
     span = SHARE if name in SHARES else UNBOUNDED  # as on the page of the claims
-    figure = sources.evidence.diagnostic(
-        method, f"{name} of {method}", lambda stage: stage.get(name), span=span
-    )
-    return figure.estimate
+    return sources.evidence.diagnostic(method, f"{name} of {method}", name, span).estimate
 
 
 # ---- claims ------------------------------------------------------------------------------------------------

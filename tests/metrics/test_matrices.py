@@ -12,7 +12,7 @@ import clbench
 from clbench.base.errors import InputError, UnknownNameError
 from clbench.metrics import Report, from_matrix
 from clbench.metrics.definitions import DEFINITIONS, FAMILIES
-from clbench.metrics.matrices import Groups, layout_of
+from clbench.metrics.matrices import layout_of
 from clbench.metrics.report import needed_cells
 from clbench.scoring.metrics import METRICS, measure
 from clbench.scoring.scores import Scores
@@ -40,14 +40,14 @@ def test_every_value_is_that_of_a_record_with_the_same_rates(scores: Callable[..
 
 
 def test_the_definitions_are_the_metrics_that_a_success_matrix_allows() -> None:
-    layout = layout_of(["a", "b", "c", "d", "e"], Groups(("a",), None, ("e",)))
+    layout = layout_of(["a", "b", "c", "d", "e"], ("a",), None, ("e",))
     allowed = {name for name, metric in METRICS.items() if needed_cells(metric, layout) is not None}
     assert set(DEFINITIONS) == allowed
     assert {one.family for one in DEFINITIONS.values()} == set(FAMILIES)
 
 
 def test_a_metric_has_no_value_exactly_if_a_cell_that_it_needs_is_missing() -> None:
-    layout = layout_of([f"task {n}" for n in range(1, 6)], Groups(("task 1",), None, ("task 5",)))
+    layout = layout_of([f"task {n}" for n in range(1, 6)], ("task 1",), None, ("task 5",))
     whole: dict[str, ArrayLike] = {"": MATRIX, "joint": JOINT, "sft": JOINT}
     for stage, task in np.ndindex(4, 5):
         holed = np.array(MATRIX)

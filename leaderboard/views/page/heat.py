@@ -11,13 +11,12 @@ from clbench.spec.policies import DEFAULT_POLICY
 
 from ...board.rows import Row
 from ...board.summary import DIVISIONS, METHODS, RANKED_BY
-from ..format import Column, title_of
+from ..format import Column, column_title
 from .charts.vega import finite
 from .numbers import MISSING, Number, number
 
 COLUMNS = tuple(
-    Column(METRICS[name], title)
-    for name, title in ((RANKED_BY, title_of(RANKED_BY)), ("adaptation", "learned"), ("kept", "kept"))
+    Column(METRICS[name], column_title(name, to_criterion=True)) for name in (RANKED_BY, "adaptation", "kept")
 )
 """Metrics of the table."""
 

@@ -23,16 +23,16 @@ from ...board.rows import Board
 from ...board.summary import DIVISIONS
 from ...board.tiers import TIERS
 from ...policies.compared import Comparisons
-from ..format import format_interval, number_text, title_of
+from ..format import column_title, format_interval, number_text, title_of
 from .charts.along import SERIES, along_a_run
 from .charts.axes import ACROSS, UP
 from .charts.decoders import decoders
 from .charts.frontier import NARROW as NARROW_FRONTIER
 from .charts.frontier import WIDE as WIDE_FRONTIER
 from .charts.frontier import frontier
-from .charts.picture import VEGA_LITE, on_paper
+from .charts.picture import VEGA_LITE, in_both_themes
 from .charts.plane import FULL, NARROW, WIDE, Plane, plane, template
-from .charts.vega import FONT, PALETTE, SHAPES, in_theme
+from .charts.vega import FONT, PALETTE, SHAPES
 from .heat import COLUMNS, heat_maps
 from .rows import MAIN, SHADES
 from .view import ScenarioView, scenarios, sorted_tables, table_title
@@ -111,12 +111,7 @@ def pictures(board: Board) -> dict[str, str]:
     specs = {"pareto": plane(rows, WIDE)}
     for scenario, curves in board.frontiers.items():
         specs[f"frontier-{folder_name(scenario)}"] = frontier(curves, WIDE_FRONTIER, FONT)
-    found = {}
-    for name, spec in specs.items():
-        svg = on_paper(spec).svg() + "\n"
-        found[f"{name}.svg"] = in_theme(svg, dark=False)
-        found[f"{name}-dark.svg"] = in_theme(svg, dark=True)
-    return found
+    return {name: svg for stem, spec in specs.items() for name, svg in in_both_themes(stem, spec).items()}
 
 
 @cache
@@ -135,6 +130,7 @@ def _templates() -> Environment:
         tiers=TIERS,
         tier_rules=TIER_RULES,
         title_of=title_of,
+        column_title=column_title,
         policy_of=lambda table: table_parts(table)[1],
         counted=counted,
         format_interval=format_interval,

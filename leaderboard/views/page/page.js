@@ -385,13 +385,14 @@
     const chosen = event.target.closest("[data-seed]");
     if (!chosen) return;
     const matrix = dialog.querySelector(".matrix");
-    matrix.mean ??= [...matrix.tBodies[0].rows].map((row) => [...row.cells].slice(1).map((cell) => cell.textContent));
+    const body = matrix.tBodies[0];
+    matrix.mean ??= body.innerHTML;
+    body.innerHTML = matrix.mean;
     const seed = data.rows[opened].seeds[chosen.dataset.seed];
-    [...matrix.tBodies[0].rows].forEach((row, stage) => [...row.cells].slice(1).forEach((cell, task) => {
-      const value = seed ? seed[stage][task] : parseFloat(matrix.mean[stage][task]);
-      const known = value !== null && !isNaN(value);
-      cell.textContent = known ? value.toFixed(2) : "–";
-      cell.className = cell.className.replace(/^\S+/, known ? `s${Math.round(value * 20)}` : "none");
+    if (seed) [...body.rows].forEach((row, stage) => [...row.cells].slice(1).forEach((cell, task) => {
+      const value = seed[stage][task];
+      cell.textContent = value === null ? "–" : value.toFixed(2);
+      cell.className = cell.className.replace(/^\S+/, value === null ? "none" : `s${Math.round(value * 20)}`);
     }));
     for (const other of chosen.parentElement.children) other.ariaPressed = String(other === chosen);
   });

@@ -24,6 +24,7 @@ from ..format import (
     Column,
     Rows,
     aligned,
+    column_title,
     format_interval,
     number_text,
     shown,
@@ -191,21 +192,14 @@ class RowView:
         return same_or_each([(run.seed, flat(run.record.fingerprint)) for run in self.row.runs])
 
 
-MAIN = {
-    RANKED_BY: "final average",
-    "gain": "gain",
-    "adaptation": "learned",
-    "retention": "kept skills",
-    "kept_targets": "kept targets",
-    "kept": "kept",
-}
-"""Metrics that a table shows at once, with their titles; it shows its other columns when the reader asks for
-them. The page calls them the same in every scenario."""
+MAIN = (RANKED_BY, "gain", "adaptation", "retention", "kept_targets", "kept")
+"""Metrics that a table shows at once, with the same titles in every scenario. It shows its other columns when
+the reader asks for them."""
 
 
 def columns(rows: Rows) -> tuple[Column, ...]:
     """Return the columns of a table of `rows`, those of `MAIN` first."""
-    main = [Column(METRICS[name], title) for name, title in MAIN.items()]
+    main = [Column(METRICS[name], column_title(name, to_criterion=True)) for name in MAIN]
     known = [one for one in main if any(row.estimates[one.metric.name].value is not None for row in rows)]
     return (*known, *(one for one in shown(rows) if one.metric.name not in MAIN))
 

@@ -202,7 +202,7 @@ def _keeping(members: Sequence[Row], baseline: Row | None) -> str:
     pool = {row.method: row for row in (baseline, *members)}
     equal = [row for row in members if row.method in _alike("adaptation", baseline.method, pool)]
     if not equal:
-        return f"{_other_learning(members[0], baseline)} {_training(members[0])}"
+        return f"{_other_learning(members[0], baseline)} {_training(members[0], baseline)}"
     leader = members[0]
     slower = "" if leader in equal else f"{_other_learning(leader, baseline)} "
     keeper = max(equal, key=lambda row: mean_difference("kept", row.scores, baseline.scores) or 0.0)
@@ -211,7 +211,7 @@ def _keeping(members: Sequence[Row], baseline: Row | None) -> str:
     if len(equal) == 1 and keeper.method != BASELINE:
         other = f"The other, {name}," if len(members) == 2 else f"Of the others, {name}"
         which = "It" if keeper is leader else other
-        return f"{slower}{which} {_beside(keeper, baseline)} {_training(keeper, whose)}"
+        return f"{slower}{which} {_beside(keeper, baseline)} {_training(keeper, baseline, whose)}"
     kept, like = _value("kept", keeper), "Of the methods that learn about as much as sft"
     if keeper.method == BASELINE:
         return f"{slower}{like}, none keeps more than sft itself ({kept})."
@@ -219,7 +219,7 @@ def _keeping(members: Sequence[Row], baseline: Row | None) -> str:
     sure = f"; in this, {_alike_text(len(peers) - 1)}" if len(peers) > 1 else ""
     if BASELINE in peers:
         sure = f", but is not told apart from sft ({_value('kept', baseline)}) in this"
-    return f"{slower}{like}, {name} keeps the most ({kept}){sure}. {_training(keeper, whose)}"
+    return f"{slower}{like}, {name} keeps the most ({kept}){sure}. {_training(keeper, baseline, whose)}"
 
 
 def _beside(row: Row, baseline: Row) -> str:
@@ -234,14 +234,14 @@ def _beside(row: Row, baseline: Row) -> str:
     return f"learns {learned} and keeps {kept}; {sure} told apart."
 
 
-def _training(row: Row, whose: str = "Its") -> str:
+def _training(row: Row, baseline: Row, whose: str = "Its") -> str:
     """Return the sentence on the training time of a row."""
     relative = row.costs["relative_cost"]
     if relative is None:
         return f"{whose} training time was not measured."
     if relative == 0:
         return f"{whose} training takes no time."
-    step = mean_step_ratio(row.runs)
+    step = mean_step_ratio([run for run in row.runs if run.seed in baseline.seeds])
     parts = ""
     if step:
         steps, step_text = (number_text(one, ".2f") for one in (relative / step, step))

@@ -143,7 +143,7 @@ class ScenarioView:
         """Whether its stages end when the target is learned."""
         return self.rows[0].row.to_criterion
 
-    @property
+    @cached_property
     def prediction(self) -> str:
         """Sentence on what predicts forgetting among the methods, empty if nothing is known."""
         return prediction_text(self.table)
@@ -162,7 +162,7 @@ class ScenarioView:
             for name, rows in divisions_of(self.table).items()
         ]
 
-    @property
+    @cached_property
     def columns(self) -> tuple[Column, ...]:
         """Columns of its table."""
         return columns(self.table)

@@ -218,7 +218,9 @@ def test_the_cost_of_aegis_includes_a_buffer_in_any_run(uses: str, time: Ends, v
     read = [{"demonstrations": "never", "questions": one} for one in ("prepare", uses)]
     record = [SimpleNamespace(run=SimpleNamespace(uses=one)) for one in read]
     runs = {"aegis": {seed: SimpleNamespace(record=one) for seed, one in enumerate(record)}}
-    assert judged("A7", {"time of aegis": time}, runs).verdict == verdict
+    finding = judged("A7", {"time of aegis": time}, runs)
+    assert finding.verdict == verdict
+    assert finding.change.startswith("Runs whose stages read no prior data.") == (uses == "throughout")
 
 
 @pytest.mark.parametrize(
@@ -235,7 +237,9 @@ def test_consft_needs_no_data_only_if_no_run_reads_any(
     uses = {"demonstrations": demonstrations, "questions": questions, "reference": False}
     record = SimpleNamespace(run=SimpleNamespace(uses=uses))
     runs = {"consft": {0: SimpleNamespace(record=record)}}
-    assert judged("C6", _costs(5, 5, (1.0, 1.05)), runs).verdict == verdict
+    finding = judged("C6", _costs(5, 5, (1.0, 1.05)), runs)
+    assert finding.verdict == verdict
+    assert finding.change.startswith("Runs that keep, add and read no more") == (verdict == "does not hold")
 
 
 def test_what_would_change_a_verdict_is_the_figure_nearest_to_the_bar() -> None:
@@ -244,6 +248,31 @@ def test_what_would_change_a_verdict_is_the_figure_nearest_to_the_bar() -> None:
     finding = judged("C2", {**BOTH, **SFT, **best, **at_one})
     assert finding.verdict == "does not hold"
     assert '"retained success, consft_calibrated@1 - sft@1" would have to move by 0.00' in finding.change
+
+
+@pytest.mark.parametrize(
+    ("identifier", "given", "named"),
+    [
+        ("A2", {**_drops((0.0, 0.009)), EARLY: (-0.049, 0.0)}, EARLY),
+        ("A2", {**_drops((0.011, 0.1)), EARLY: (-0.2, 0.0)}, ANSWERS.format("stop_gradient")),
+        ("A2", {**_drops((0.0, 0.011)), EARLY: (-0.2, -0.051)}, ANSWERS.format("stop_gradient")),
+        ("A2", {**_drops((0.0, 0.009)), EARLY: (-0.2, -0.049)}, EARLY),
+        ("A3", _lora((LOST, LOST, LOST)), "question retention, lora - frozen"),
+        ("A3", _lora((KEPT, KEPT, (-0.011, 0.01))), "question retention, lora+rank=64 - frozen"),
+        ("A3", _lora((LOST, LOST, (-0.1, -0.009))), "question retention, lora+rank=64 - frozen"),
+        ("A3", _lora((KEPT, KEPT, KEPT), skills=(-0.051, -0.049)), "retention, lora - frozen"),
+    ],
+)
+def test_what_would_change_a_verdict_is_what_decides_it(identifier: str, given: Given, named: str) -> None:
+    assert f'"{named}"' in judged(identifier, given).change
+
+
+def test_the_worse_replay_decides() -> None:
+    good, bad = (-0.05, 0.1), (-0.3, -0.06)
+    given = {**kept(good, good, "experience_replay"), **kept(bad, bad, "buffered_replay")}
+    finding = judged("C3", {**BOTH, **given})
+    assert finding.verdict == "does not hold"
+    assert '- buffered_replay" would have to move by' in finding.change
 
 
 @pytest.mark.parametrize(("own", "shown"), [(0.1, True), (0.3, False)])

@@ -63,3 +63,9 @@ def on_paper(spec: Spec) -> Plot:
 def themed(spec: Spec, dark: bool) -> Plot:
     """Return a chart with a background, in the colours of a theme."""
     return Plot(json.loads(in_theme(json.dumps(on_paper(spec).spec), dark)))
+
+
+def in_both_themes(stem: str, spec: Spec) -> dict[str, str]:
+    """Return a chart as SVG, for a light and a dark page, by the names of its files."""
+    svg = on_paper(spec).svg() + "\n"
+    return {f"{stem}.svg": in_theme(svg, dark=False), f"{stem}-dark.svg": in_theme(svg, dark=True)}

@@ -189,10 +189,14 @@ def test_a_row_has_each_seed_its_curves_and_every_definition(open_page: Callable
     page = open_page("clbench/Other-v0/sft")
     learned = row(page).locator(".matrix .learned").last
     expect(learned).to_have_text("0.90")
+    cells = row(page).locator(".matrix tbody")
+    mean = cells.inner_html()
     row(page).get_by_role("button", name="seed 1").click()
     expect(learned).to_have_text("1.00")
     row(page).get_by_role("button", name="seed 0").click()
     expect(learned).to_have_text("0.80")
+    row(page).get_by_role("button", name="mean").click()
+    assert cells.inner_html() == mean
     row(page).get_by_role("button", name="seed 1").click()
     expect(row(page).get_by_role("button", name="seed 1")).to_have_attribute("aria-pressed", "true")
     row(page).get_by_text("The curves as a table").click()
