@@ -41,6 +41,7 @@ from clbench.runs.spec import RunSpec
 from clbench.scoring.scores import Scores
 from clbench.spec.identifiers import built_in_methods
 from clbench.spec.protocol import check_steps
+from clbench.worlds import gl_backend
 
 collect_ignore = ["submission"]
 """A package of its own, which test_submission.py installs and tests."""
@@ -61,6 +62,27 @@ def _one_core_each() -> Iterator[None]:
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("OMP_NUM_THREADS", "1")
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _short_measurements() -> Iterator[None]:
+    """Measure the time of a step with two pairs of blocks: test_step_time.py has all five."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("clbench.runs.step_time.ROUNDS", 2)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _toys_can_be_drawn() -> Iterator[None]:
+    """Try no back end for the toy, which draws by itself: each try starts PyTorch."""
+    usual = gl_backend.rendering_fault
+
+    def fault(back_end: str, world: str | None = None) -> str | None:
+        return None if (world or "").endswith(":ToyWorld") else usual(back_end, world)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gl_backend, "rendering_fault", fault)
         yield
 
 

@@ -24,11 +24,8 @@ def _python(code: str, folder: Path) -> str:
 
 
 def _console(block: str, folder: Path) -> str:
-    line = (
-        block.strip()
-        .replace("clbench/Fetch-v1", "clbench.testing:clbench/Toy-v0")
-        .replace("--seeds 3", "--seeds 1")
-    )
+    line = block.strip().replace("clbench/Fetch-v1", "clbench.testing:clbench/Toy-v0")
+    line = re.sub(r"--seeds \d+", "--seeds 1", line)
     command = [sys.executable, "-m", *line.split()]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout
 

@@ -164,12 +164,14 @@ def test_leases_are_given_back_if_closing_is_interrupted(tmp_path: Path, bars: B
 
 SUSPENDED = """
 import signal
+from multiprocessing.context import BaseContext
 from jobs_with_children import waits
 from clbench.jobs.job import Job
 from clbench.jobs.processes import Processes
 
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where a shell began the tests with &
+    BaseContext.set_forkserver_preload = lambda *_: None  # this job needs no PyTorch
     workers = Processes(1)
     workers.start(Job("waits", waits, {"path": "worker"}, 1))
     try:

@@ -297,6 +297,7 @@ def test_an_mp4_without_its_package_names_it(
 FETCH = """
 import sys
 from pathlib import Path
+from clbench.evaluation.episodes import Trial
 from clbench.runs.film import shoot
 from clbench.policy.transformer import TransformerPolicy
 from clbench.learning.pretraining import policy_config

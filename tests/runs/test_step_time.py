@@ -46,6 +46,12 @@ def _timing(method: str, folder: Path, **options: Any) -> Any:
     return record.timing
 
 
+@pytest.fixture(autouse=True)
+def _all_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measure with all pairs of blocks, as users do; other tests have two."""
+    monkeypatch.setattr("clbench.runs.step_time.ROUNDS", 5)
+
+
 @pytest.fixture
 def _a_second_for_each_loss(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the clock of the measurement go on by a second with each loss, however busy the machine is."""

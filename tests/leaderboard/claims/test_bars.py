@@ -362,6 +362,13 @@ def test_a_saving_of_steps_counts_from_a_twentieth_on(
     assert judged(identifier, given).verdict == verdict
 
 
+def test_a_random_vector_that_is_as_good_decides_on_the_vector(monkeypatch: pytest.MonkeyPatch) -> None:
+    stage = Figure("median", ("sft@1",), Estimate(20, None, None))
+    monkeypatch.setattr(f"{MODULE}.fast_dvla.median_stage", lambda *_: stage)
+    assert f'"{RANDOM}"' in judged("F2", {**HELPS, VECTOR: FAST, RANDOM: SLOW}).change
+    assert f'"{VECTOR}"' in judged("F2", {**HELPS, VECTOR: SLOW, RANDOM: FAST}).change
+
+
 @pytest.mark.parametrize(("time", "says"), [((1.06, 1.2), True), ((1.04, 1.2), False)])
 def test_steps_are_said_to_cost_more_time_in_all_only_where_both_lower_ends_do(
     time: Ends, says: bool, monkeypatch: pytest.MonkeyPatch
