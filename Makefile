@@ -169,7 +169,7 @@ CHECKED := tests/leaderboard/test_records.py tests/evaluation/test_definition.py
 check: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/mypy --num-workers 2
+	$(BIN)/mypy
 	$(BIN)/pytest -m slow $(CHECKED)
 
 # Tests of the built wheel outside the checkout, where it could differ from the checkout: its files, the parts that are

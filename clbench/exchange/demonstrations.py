@@ -104,7 +104,7 @@ def check_output(output: Path | str, kind: str, tasks: Sequence[Task]) -> Path:
     return Path(output)
 
 
-def _without_noise(task: Task, episodes: Sequence[Demonstration]) -> Sequence[Demonstration]:
+def _without_noise(task: Task, episodes: Sequence[Demonstration]) -> list[Demonstration]:
     clean = [episode for episode in episodes if not episode.noisy.any()]
     if not clean:
         raise InputError(f"All {counted(len(episodes), 'demonstration')} of {task.name} have action noise.")

@@ -6,8 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 
 from clbench.records.reader import RecordError
-from clbench.records.record import Record
-from clbench.scoring.reading import EpisodeRow
+from clbench.records.record import EpisodeRow, Record
 from clbench.spec.policies import is_built_in
 from clbench.spec.protocol import EpisodeKey, Point, Protocol
 

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from clbench.records.record import Record
+from clbench.records.record import EpisodeRow, Record
 from clbench.scoring.completeness import check_complete
 from clbench.scoring.layout import Array, Layout
 from clbench.scoring.rates import MEASURED, Measured, Rates, check_same, stacked
 from clbench.scoring.reading import (
-    EpisodeRow,
     numbers,
     place,
     read_answers,
