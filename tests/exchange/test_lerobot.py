@@ -271,7 +271,8 @@ def test_episodes_with_action_noise_can_be_left_out(tmp_path: Path, episodes: li
     folder = export_demonstrations(TOY, tmp_path / "clean", format="lerobot", noisy=False)
     assert _info(folder)["total_episodes"] == len(clean)
     rows = _rows(next((folder / "data").rglob("*.parquet")))
-    assert np.array_equal(np.stack(rows["action"]), np.concatenate([episode.expert[:-1] for episode in clean]))
+    expected = np.concatenate([episode.expert[:-1] for episode in clean])
+    assert np.array_equal(np.stack(rows["action"]), expected)
     assert not rows["noisy"].any()
 
 
