@@ -86,7 +86,7 @@ def test_no_two_jobs_of_a_plan_have_one_title_with_a_policy_of_a_class(
             plan.add_run(RunSpec(scenario, "sft", 0, policy=policy).resolve(), tmp_path)
     titles = [job.title for job in plan.jobs]
     assert len(titles) == len(set(titles))
-    assert "me--Tiny-v0+clbench.policy.transformer--TransformerPolicy pretraining seed 0" in titles
+    assert "me--Tiny-v0+clbench.policy.transformer.TransformerPolicy pretraining seed 0" in titles
 
 
 FAILING = """

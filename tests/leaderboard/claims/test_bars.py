@@ -257,10 +257,10 @@ def test_what_would_change_a_verdict_is_the_figure_nearest_to_the_bar() -> None:
         ("A2", {**_drops((0.011, 0.1)), EARLY: (-0.2, 0.0)}, ANSWERS.format("stop_gradient")),
         ("A2", {**_drops((0.0, 0.011)), EARLY: (-0.2, -0.051)}, ANSWERS.format("stop_gradient")),
         ("A2", {**_drops((0.0, 0.009)), EARLY: (-0.2, -0.049)}, EARLY),
-        ("A3", _lora((LOST, LOST, LOST)), "question retention, lora - frozen"),
+        ("A3", _lora((LOST, LOST, LOST)), "question retention, lora+rank=4 - frozen"),
         ("A3", _lora((KEPT, KEPT, (-0.011, 0.01))), "question retention, lora+rank=64 - frozen"),
         ("A3", _lora((LOST, LOST, (-0.1, -0.009))), "question retention, lora+rank=64 - frozen"),
-        ("A3", _lora((KEPT, KEPT, KEPT), skills=(-0.051, -0.049)), "retention, lora - frozen"),
+        ("A3", _lora((KEPT, KEPT, KEPT), skills=(-0.051, -0.049)), "retention, lora+rank=4 - frozen"),
     ],
 )
 def test_what_would_change_a_verdict_is_what_decides_it(identifier: str, given: Given, named: str) -> None:

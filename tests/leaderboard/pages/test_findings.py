@@ -145,7 +145,7 @@ def test_a_gain_that_is_not_certain_over_a_tied_setting_is_no_yes(
     assert "On clbench/Even-v1, yes" not in text
     assert "On clbench/Even-v1, not for certain: `finch` gains 0.300" in text
     assert (
-        "but 0.000 [0.000, 0.000] at 0.1 times the scenario's learning rate, which tuning rated as highly "
+        "but 0.000 [0.000, 0.000] at 0.1 times the scenario's learning rate, which scored the same in tuning "
         "(4 seeds)." in text
     )
 

@@ -142,6 +142,6 @@ def test_a_gain_that_another_setting_of_plain_fine_tuning_takes_back_is_told_bel
     tied = {"lora": (TiedGain(0.1, Estimate(0.007, -0.016, 0.03), 4),)}
     assert "not for certain" not in markdown(board, {})
     assert (
-        "but 0.007 [-0.016, 0.030] at 0.1 times the scenario's learning rate, which tuning rated as highly "
-        "(4 seeds)."
+        "but 0.007 [-0.016, 0.030] at 0.1 times the scenario's learning rate, which scored the same in "
+        "tuning (4 seeds)."
     ) in markdown(dataclasses.replace(board, tied={"clbench/Even-v1": tied}), {}).replace("\\", "")
