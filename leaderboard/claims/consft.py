@@ -19,6 +19,7 @@ from .arms import (
 )
 from .claim import (
     ANYWHERE,
+    BOARDS,
     Finding,
     Paper,
     Verdict,
@@ -57,6 +58,7 @@ CONSFT = Paper("ConSFT", ("2605.08879",))
     "0.05; does not hold if the upper end is below 0.05.",
     settled="2026-11-23T07:13Z",
     margin="0.05 of the retained success",
+    scenarios=(*BOARDS, "clbench/LiberoSpatial-v1"),
 )
 def sft_degrades(evidence: Evidence) -> Finding:
     """Fine-tuning without constraint degrades pretrained skills."""
