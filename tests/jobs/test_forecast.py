@@ -1,5 +1,6 @@
 """The forecast of a command: the time from the lengths of its jobs, the disk from what they keep."""
 
+import dataclasses
 import itertools
 import types
 from pathlib import Path
@@ -79,3 +80,7 @@ def test_the_time_of_a_step_is_the_median_without_the_first(monkeypatch: pytest.
     clock = itertools.accumulate(taken)  # the clock is read at the end of each step
     monkeypatch.setattr(module, "time", types.SimpleNamespace(perf_counter=lambda: next(clock)))
     assert step_seconds(TINY) == (1 + STEPS) / 2
+
+
+def test_the_step_of_a_scenario_without_targets_is_timed() -> None:
+    assert step_seconds(dataclasses.replace(TINY, target=())) > 0

@@ -162,6 +162,25 @@ def test_a_training_time_is_a_multiple_of_that_of_plain_fine_tuning(board: Calla
         )
 
 
+def test_steps_and_their_time_are_those_of_the_seeds_of_plain_fine_tuning(
+    board: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = board(sft=matrix(0.1), lora=matrix(0.9))
+    monkeypatch.setattr(
+        "clbench.leaderboard.board.costs.step_ratio", lambda run: 1.5 if run.seed < 2 else 9.0
+    )
+    priced = [
+        dataclasses.replace(
+            row,
+            costs=row.costs | {"relative_cost": 3.0},
+            **({"seeds": row.seeds[:2]} if row.method == "sft" else {}),
+        )
+        for row in rows
+    ]
+    (verdict,) = verdicts(priced)
+    assert "3.00 times as long as sft's: 2.00 times the steps, each 1.50 times as long." in verdict.keeping
+
+
 def test_a_leader_that_learns_less_does_not_keep_most_of_those_that_learn_alike(
     board: Callable[..., Any],
 ) -> None:
