@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.stats import hypergeom
@@ -51,9 +52,16 @@ def replay(subject: Subject, progress: ProgressCallback) -> list[Check]:
         check_device(spec.device)
     except InputError as error:  # the rest needs the device of the run
         return [Check("policies", str(error), None)]
-    _, folder = pretrained_policy(subject.scenario, spec.seed)
-    if pretrained_hash(folder) != run.record.fingerprint.get("pretrained"):
-        return [Check("policies", _other_pretraining(subject), None)]
+    theirs, ours = (_instructions(made) for made in (run.record.fingerprint, subject.here))
+    # the shipped policy of seed 0 is the same on all processors, but training it further is not
+    another_processor = theirs not in (None, ours)
+    if another_processor or not _same_pretraining(subject):
+        result = (
+            f"{'training' if another_processor else 'pretraining'} does not give the same policy here as on "
+            f"the machine of the record (instructions of its processor: {theirs}, here: {ours}): repeat it "
+            "on one like that"
+        )
+        return [Check("policies", result, None)]
     kept = kept_stages(subject.resolved, subject.request.checkpoints)
     with deterministic(spec.device):
         if kept is None:
@@ -70,15 +78,16 @@ def replay(subject: Subject, progress: ProgressCallback) -> list[Check]:
     return checks
 
 
-def _other_pretraining(subject: Subject) -> str:
-    """Return why the policies of a record cannot be compared with those of this machine."""
-    hardware = subject.run.record.fingerprint.get("hardware")
-    theirs = hardware.get("instructions") if isinstance(hardware, dict) else None
-    ours = subject.here["hardware"]["instructions"]
-    return (
-        "pretraining does not give the same policy here as on the machine of the record "
-        f"(instructions of its processor: {theirs}, here: {ours}): repeat it on one like that"
-    )
+def _instructions(made: dict[str, Any]) -> Any:
+    """Return the instructions of the processor in a fingerprint, None if it does not have them."""
+    hardware = made.get("hardware")
+    return hardware.get("instructions") if isinstance(hardware, dict) else None
+
+
+def _same_pretraining(subject: Subject) -> bool:
+    """Return whether the run began with the policy that pretraining gives here."""
+    _, folder = pretrained_policy(subject.scenario, subject.spec.seed)
+    return pretrained_hash(folder) == subject.run.record.fingerprint.get("pretrained")
 
 
 def _start(subject: Subject, first: Policy, progress: ProgressCallback) -> Check:

@@ -22,6 +22,7 @@ from clbench.base.cache import cached
 from clbench.base.errors import ClbenchError, UnknownNameError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.strict_json import StrictJSONError, read_regular
+from clbench.data.demonstrations import simulator_versions
 from clbench.jobs.job import Job, JobError
 from clbench.jobs.processes import Processes
 from clbench.jobs.scheduler import run_with_bars
@@ -152,12 +153,28 @@ def _recompute(subject: Subject, _: ProgressCallback) -> list[Check]:
     except ClbenchError as error:
         return [*checks, Check("what was run", str(error.args[0]), None)]
     checks += [_check_horizons(run.record, scenario), _check_what_was_run(subject, info)]
-    recorded, found = run.record.fingerprint.get("rollouts"), subject.here["rollouts"]
+    return [*checks, _check_simulator(subject), _check_definition(subject)]
+
+
+def _check_simulator(subject: Subject) -> Check:
+    """Check that the simulator moves as it did."""
+    recorded, found = subject.run.record.fingerprint.get("rollouts"), subject.here["rollouts"]
+    if recorded == found:
+        return Check("simulator", "same rollouts as here", True)
     worlds = ", ".join(differences(recorded, found)) or "all worlds"
-    result = (
-        "same rollouts as here" if recorded == found else f"the rollouts of {worlds} differ from those here"
-    )
-    return [*checks, Check("simulator", result, recorded == found), _check_definition(subject)]
+    return _differs(subject, "simulator", f"the rollouts of {worlds} differ from those here")
+
+
+def _differs(subject: Subject, name: str, result: str) -> Check:
+    """Return the check of what differs here: with another version of the simulator, it may be true there."""
+    recorded = subject.run.record.fingerprint.get("versions")
+    before = recorded if isinstance(recorded, dict) else {}
+    other = [
+        f"{package} was {before[package]} and is {version} here"
+        for package, version in simulator_versions(subject.scenario.tasks).items()
+        if before.get(package, version) != version
+    ]
+    return Check(name, "; ".join([result, *other]), None if other else False)
 
 
 def _check_what_was_run(subject: Subject, info: RunInfo | None) -> Check:
@@ -190,7 +207,7 @@ def _check_definition(subject: Subject) -> Check:
         return Check("definition", "the record is older than definitions: not compared", True)
     other = other_parts(recorded, subject.here["definition"])
     if other:
-        return Check("definition", f"{', '.join(other)} differ from the installed code", False)
+        return _differs(subject, "definition", f"{', '.join(other)} differ from the installed code")
     later = [name for name in subject.here["definition"] if name.startswith(LATER) and name not in recorded]
     missing = f"; the record says nothing of {', '.join(later)}: not compared" if later else ""
     return Check("definition", f"tasks and questions are those here{missing}", True)
@@ -256,14 +273,17 @@ def _check_origin(subject: Subject, again: Record) -> Check:
     theirs, ours = (_origin(record) for record in (subject.run.record, again))
     wrong = [f"{name} {theirs.get(name)} is {ours.get(name)} here" for name in differences(theirs, ours)]
     if wrong:
-        return Check("origin", f"the record states what is not so here: {some(wrong)}", False)
+        # on another machine, or with other packages, nobody can tell whether these are true
+        elsewhere = all(name.startswith(("versions ", "hardware ")) for name in differences(theirs, ours))
+        result = f"the record states what is not so here: {some(wrong)}"
+        return Check("origin", result, None if elsewhere else False)
     methods = [record.fingerprint.get("method") for record in (subject.run.record, again)]
     source = [values.get("source") if isinstance(values, dict) else None for values in methods]
     same = "the method's source is the same" if source[0] == source[1] else "the method's source has changed"
     return Check(
         "origin",
-        f"versions, instructions and metadata are those here; {same}; commit, processor, Python and times "
-        "cannot be compared",
+        f"versions, instructions and metadata are those here; {same}; the version and commit of clbench, "
+        "processor, Python and times cannot be compared",
         True,
     )
 
@@ -275,6 +295,7 @@ def _origin(record: Record) -> dict[str, Any]:
         values = record.fingerprint.get(part)
         entries = values if isinstance(values, dict) else {}
         found |= {f"{part} {name}": entries.get(name) for name in names or sorted(entries)}
+    found.pop("versions clbench", None)  # a later one may score the same, as its commit may
     return {**found, "pretrained": record.fingerprint.get("pretrained")}
 
 

@@ -173,6 +173,12 @@ FORGERIES = {
     "another pretrained policy": Forgery(
         "replayed", "pretraining does not give the same policy", set_in("fingerprint", pretrained="0" * 16)
     ),
+    "other instructions of the processor": Forgery(
+        "replayed",
+        "policies: training does not give the same policy here as on the machine of the record (instructions "
+        "of its processor: NEON, here: ",
+        set_in("fingerprint.hardware", instructions="NEON"),
+    ),
     # ---- what only the whole run says
     "a success on the way": Forgery(
         "retrained", "whole run: repeated, episodes (success)", lambda values: flip(values, 0, 30)
@@ -196,11 +202,6 @@ FORGERIES = {
         "retrained",
         "origin: the record states what is not so here: versions torch 1.0 is ",
         set_in("fingerprint.versions", torch="1.0"),
-    ),
-    "other instructions of the processor": Forgery(
-        "retrained",
-        "origin: the record states what is not so here: hardware instructions NEON is ",
-        set_in("fingerprint.hardware", instructions="NEON"),
     ),
     "no hardware": Forgery(
         "retrained",

@@ -1,5 +1,6 @@
 """Replaying: the policies that a run kept must begin where pretraining ends."""
 
+import hashlib
 import importlib
 import json
 import shutil
@@ -90,3 +91,39 @@ def test_the_replayed_episodes_are_drawn_at_random_from_the_ends_of_all_stages(
     assert [sum(map(len, stages)) for stages in looks] == [10] * 6
     assert all(sum(len(stages[number]) for stages in looks) > 6 for number in range(3))
     assert len({str(stages) for stages in looks}) == 6
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("tier", "change", "message"),
+    [
+        ("replayed", {"hardware": {"instructions": "NEON"}}, "instructions of its processor: NEON, here: "),
+        ("retrained", {"versions": {"torch": "1.0"}}, "versions torch 1.0 is "),
+        ("recomputed", {"versions": {"mujoco": "1.0"}, "rollouts": {}}, "mujoco was 1.0 and is "),
+    ],
+)
+def test_a_machine_that_cannot_tell_takes_no_tier_away(
+    mine: Path,
+    honest: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    tier: str,
+    change: dict[str, Any],
+    message: str,
+) -> None:
+    module = "clbench.leaderboard.submission.verify"
+    monkeypatch.setattr(f"{module}.simulator_versions", lambda tasks: {"mujoco": "3.0"})
+    verify(mine, "recomputed", honest)
+    earned = tiers.verification_path(mine)
+    stored = json.loads(earned.read_text(encoding="utf-8"))
+
+    def made_elsewhere(values: dict[str, Any]) -> None:
+        for part, entries in change.items():
+            values["fingerprint"][part] = {**values["fingerprint"][part], **entries} if entries else entries
+
+    edit(mine, made_elsewhere)
+    digest = hashlib.sha256(mine.read_bytes()).hexdigest()
+    earned.write_text(tiers.verification_text({**stored, "tier": "retrained", "record": digest}))
+    (check,) = (check for check in verify(mine, tier, honest) if not check.passed)
+    assert message in check.found
+    assert check.passed is None
+    assert tiers.tier_of(mine) == "retrained"
