@@ -19,6 +19,7 @@ from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 
 TOY = "clbench.testing:clbench/Toy-v0"
+TINY = "tiny:me/Tiny-v0"
 
 PLACES = {name: place for commands in COMMANDS.values() for name, place in commands.items()}
 """Entry points of all commands."""
@@ -267,8 +268,8 @@ def test_a_hyper_parameter_set_in_the_usual_way_is_told_the_right_one(
 def test_a_dry_run_counts_recorded_runs_whose_policies_would_be_made_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    execute(RunSpec(TOY, "frozen", 0), tmp_path / "records")
-    command = ["run", TOY, "frozen", "--seeds", "1", "--records", str(tmp_path / "records")]
+    execute(RunSpec(TINY, "frozen", 0), tmp_path / "records")
+    command = ["run", TINY, "frozen", "--seeds", "1", "--records", str(tmp_path / "records")]
     app([*command, "--dry-run"], result_action="return_value")
     assert capsys.readouterr().out == "1 of 1 run done already.\n"
     app([*command, "--dry-run", "--checkpoints", str(tmp_path / "kept")], result_action="return_value")
@@ -284,14 +285,15 @@ def test_a_quiet_run_prints_failures_alone(
 ) -> None:
     write_module("loud", METHOD)  # a name of its own: the module stays imported
     app(
-        ["run", TOY, "frozen", "--seeds", "1", "-q", "--records", str(tmp_path)], result_action="return_value"
+        ["run", TINY, "frozen", "--seeds", "1", "-q", "--records", str(tmp_path)],
+        result_action="return_value",
     )
     assert capsys.readouterr() == ("", "")
     with pytest.raises(SystemExit):
-        app(["run", TOY, "loud:Broken", "--seeds", "1", "-q", "--records", str(tmp_path)])
+        app(["run", TINY, "loud:Broken", "--seeds", "1", "-q", "--records", str(tmp_path)])
     said = capsys.readouterr().err
     assert said.startswith(
-        "Toy-v0 loud:Broken seed 0: failed in loss() of stage 1 (right): ValueError: no idea"
+        "me--Tiny-v0 loud:Broken seed 0: failed in loss() of stage 1 (right): ValueError: no idea"
     )
 
 

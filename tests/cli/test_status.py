@@ -17,20 +17,20 @@ from clbench.records.writer import write_record
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 
-TOY = "clbench.testing:clbench/Toy-v0"
+TINY = "tiny:me/Tiny-v0"
 
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory) -> Record:
     """A run of frozen."""
-    return execute(RunSpec(TOY, "frozen", seed=0), tmp_path_factory.mktemp("done"))
+    return execute(RunSpec(TINY, "frozen", seed=0), tmp_path_factory.mktemp("done"))
 
 
 @pytest.fixture
 def records(done: Record, tmp_path: Path) -> Path:
     """Return a folder with one run of frozen that is done, and one of sft that cannot be read."""
-    write_record(done, RunSpec(TOY, "frozen", seed=0).path(tmp_path))
-    damaged = RunSpec(TOY, "sft", seed=0).path(tmp_path)
+    write_record(done, RunSpec(TINY, "frozen", seed=0).path(tmp_path))
+    damaged = RunSpec(TINY, "sft", seed=0).path(tmp_path)
     damaged.parent.mkdir()
     damaged.write_text("{", encoding="utf-8")
     return tmp_path
@@ -39,11 +39,11 @@ def records(done: Record, tmp_path: Path) -> Path:
 def test_a_record_of_a_newer_clbench_is_unreadable_and_not_damaged(
     records: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    newer = RunSpec(TOY, "sft", seed=0).path(records)
+    newer = RunSpec(TINY, "sft", seed=0).path(records)
     newer.write_text('{"schema": 99}', encoding="utf-8")
     resolve("clbench.cli.status:status")(records=records)
     shown = capsys.readouterr().out
-    assert "Toy-v0/sft/seed-0: unreadable, " in shown
+    assert "me--Tiny-v0/sft/seed-0: unreadable, " in shown
     assert "2 runs: 1 done, 1 unreadable." in shown
 
 
@@ -51,14 +51,14 @@ def test_a_record_of_a_newer_clbench_is_unreadable_and_not_damaged(
 def test_it_counts_the_runs_of_a_request_by_their_states(
     records: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    lease = Lease(RunSpec(TOY, "frozen", seed=1).path(records))
+    lease = Lease(RunSpec(TINY, "frozen", seed=1).path(records))
     assert lease.take()
     lease.report(0.25)
-    resolve("clbench.cli.status:status")(TOY, "frozen", "sft", seeds=3, records=records)
+    resolve("clbench.cli.status:status")(TINY, "frozen", "sft", seeds=3, records=records)
     lease.release()
     shown = capsys.readouterr().out
-    assert re.search(r"Toy-v0/frozen/seed-1: 25% after \d+:\d\d", shown)
-    assert "Toy-v0/sft/seed-0: damaged, " in shown
+    assert re.search(r"me--Tiny-v0/frozen/seed-1: 25% after \d+:\d\d", shown)
+    assert "me--Tiny-v0/sft/seed-0: damaged, " in shown
     assert re.search(r"6 runs: 1 done, 1 running, 1 damaged, 3 to do\. About \d+:\d\d left", shown)
 
 
@@ -67,20 +67,20 @@ def test_without_a_request_it_shows_what_is_in_the_folder(
 ) -> None:
     resolve("clbench.cli.status:status")(records=records, as_json=True)
     found = {entry["run"]: entry["state"] for entry in json.loads(capsys.readouterr().out)}
-    assert found == {"Toy-v0/frozen/seed-0": "done", "Toy-v0/sft/seed-0": "damaged"}
+    assert found == {"me--Tiny-v0/frozen/seed-0": "done", "me--Tiny-v0/sft/seed-0": "damaged"}
 
 
 def test_a_record_that_run_would_do_again_is_not_done(
     records: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = RunSpec(TOY, "frozen", seed=0).path(records)
+    path = RunSpec(TINY, "frozen", seed=0).path(records)
     record = read_record(path)
     for column in record.episodes.values():
         del column[-1]
     write_record(record, path)
-    assert not has_record(RunSpec(TOY, "frozen", seed=0).resolve(), records)
+    assert not has_record(RunSpec(TINY, "frozen", seed=0).resolve(), records)
     resolve("clbench.cli.status:status")(records=records)
-    assert "Toy-v0/frozen/seed-0: damaged, " in capsys.readouterr().out
+    assert "me--Tiny-v0/frozen/seed-0: damaged, " in capsys.readouterr().out
 
 
 def test_a_record_of_other_settings_is_not_that_of_the_run(
@@ -88,11 +88,11 @@ def test_a_record_of_other_settings_is_not_that_of_the_run(
 ) -> None:
     settings = {**done.run.settings, "step_factor": 0.25}
     other = dataclasses.replace(done, run=dataclasses.replace(done.run, settings=settings))
-    write_record(other, RunSpec(TOY, "frozen", seed=0).path(tmp_path))
-    assert not has_record(RunSpec(TOY, "frozen", seed=0).resolve(), tmp_path)
-    resolve("clbench.cli.status:status")(TOY, "frozen", seeds=1, records=tmp_path)
+    write_record(other, RunSpec(TINY, "frozen", seed=0).path(tmp_path))
+    assert not has_record(RunSpec(TINY, "frozen", seed=0).resolve(), tmp_path)
+    resolve("clbench.cli.status:status")(TINY, "frozen", seeds=1, records=tmp_path)
     shown = capsys.readouterr().out
-    assert "Toy-v0/frozen/seed-0: to do, the record there has other settings, budget or code" in shown
+    assert "me--Tiny-v0/frozen/seed-0: to do, the record there has other settings, budget or code" in shown
     assert "1 run: 1 to do." in shown
     resolve("clbench.cli.status:status")(records=tmp_path)
     assert "1 run: 1 done." in capsys.readouterr().out
@@ -121,12 +121,12 @@ def test_a_long_reason_is_cut_and_names_the_record(
     done: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     error = {"where": "stage 1", "type": "ValueError", "message": "x" * 3000, "traceback": ""}
-    path = RunSpec(TOY, "frozen", seed=0).path(tmp_path)
+    path = RunSpec(TINY, "frozen", seed=0).path(tmp_path)
     write_record(dataclasses.replace(done, status="failed", error=error), path)
     resolve("clbench.cli.status:status")(records=tmp_path)
     (line,) = (line for line in capsys.readouterr().out.splitlines() if "failed, stage 1" in line)
     assert len(line) < 600
-    assert line.endswith("xxx [... Toy-v0/frozen/seed-0.json has the rest]")
+    assert line.endswith("xxx [... me--Tiny-v0/frozen/seed-0.json has the rest]")
 
 
 def test_names_of_folders_control_no_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,6 +23,7 @@ from clbench.runs.spec import RunSpec
 from clbench.runs.stages import has_stages
 
 TOY = "clbench.testing:clbench/Toy-v0"
+TINY = "tiny:me/Tiny-v0"
 
 METHOD = """
 from dataclasses import dataclass
@@ -70,12 +71,12 @@ def test_a_class_of_a_module_runs_in_processes_and_its_change_is_noticed(
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "slow.py").write_text(METHOD, encoding="utf-8")
     module = importlib.import_module("slow")
-    (record,) = clbench.run(TOY, module.Slow, seeds=1, records=tmp_path / "records")
+    (record,) = clbench.run(TINY, module.Slow, seeds=1, records=tmp_path / "records")
     assert (record.run.method, record.run.seed) == ("slow:Slow", 0)
-    assert clbench.run(TOY, module.Slow, seeds=1, records=tmp_path / "records") == [record]
+    assert clbench.run(TINY, module.Slow, seeds=1, records=tmp_path / "records") == [record]
     (tmp_path / "slow.py").write_text(f"{METHOD}    _speed = 1\n", encoding="utf-8")
     capsys.readouterr()
-    (again,) = clbench.run(TOY, importlib.reload(module).Slow, seeds=1, records=tmp_path / "records")
+    (again,) = clbench.run(TINY, importlib.reload(module).Slow, seeds=1, records=tmp_path / "records")
     assert "the code of slow:Slow has changed since" in capsys.readouterr().err
     assert again.fingerprint["method"] != record.fingerprint["method"]
     assert again.episodes == record.episodes
@@ -85,7 +86,7 @@ def test_a_class_of_a_module_runs_in_processes_and_its_change_is_noticed(
 def test_an_installed_method_is_named_by_its_class(tmp_path: Path) -> None:
     settings = {"step_factor": 0.5}
     records = clbench.run(
-        TOY, clbench.load_method("frozen"), seeds=1, first_seed=3, settings=settings, records=tmp_path
+        TINY, clbench.load_method("frozen"), seeds=1, first_seed=3, settings=settings, records=tmp_path
     )
     assert [(one.run.method, one.run.seed, one.run.changes) for one in records] == [("frozen", 3, settings)]
 
@@ -100,7 +101,7 @@ def test_a_failed_run_raises_with_its_reason(
 """
     write_module("lossless", METHOD + loss)
     with pytest.raises(clbench.RunsFailedError, match=r"Slow seed 0: .*ArithmeticError: no loss today"):
-        clbench.run(TOY, "lossless:Slow", seeds=1, records=tmp_path / "records")
+        clbench.run(TINY, "lossless:Slow", seeds=1, records=tmp_path / "records")
 
 
 @pytest.mark.long
@@ -115,9 +116,9 @@ def test_a_method_that_changes_the_folder_leaves_its_record_where_it_was_asked_f
 """
     write_module("moving", METHOD + start_task)
     monkeypatch.chdir(tmp_path)
-    (record,) = clbench.run(TOY, "moving:Slow", seeds=1, records="records", workers=1)
+    (record,) = clbench.run(TINY, "moving:Slow", seeds=1, records="records", workers=1)
     assert record.status == "success"
-    assert (tmp_path / "records/Toy-v0/moving.Slow/seed-0.json").is_file()
+    assert (tmp_path / "records/me--Tiny-v0/moving.Slow/seed-0.json").is_file()
 
 
 def test_runs_that_failed_are_not_counted_and_neither_are_the_jobs_that_they_share(
@@ -151,7 +152,7 @@ def test_a_class_inside_a_function_is_refused(tmp_path: Path) -> None:
 def test_a_run_of_another_command_that_kept_no_policies_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    spec, records = RunSpec(TOY, "frozen", 0), tmp_path / "records"
+    spec, records = RunSpec(TINY, "frozen", 0), tmp_path / "records"
 
     def elsewhere(jobs: Sequence[Job], *_: Any) -> dict[Job, str]:
         """Do the run as another command does, which names no folder for policies."""

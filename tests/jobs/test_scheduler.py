@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 from helpers import printed
 from rich.console import Console
+from tiny import TINY
 
 from clbench.base.errors import InputError
 from clbench.jobs.bars import Bars
@@ -28,7 +29,6 @@ from clbench.learning.pretraining import pretrained_policy
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.runs.start import evaluate_pretrained
-from clbench.spec.registry import load_scenario
 
 TOY = "clbench.testing:clbench/Toy-v0"
 
@@ -341,14 +341,13 @@ def test_a_run_waits_for_the_data_that_it_needs_and_no_other_data_is_made(
     tmp_path: Path, empty_caches: Path
 ) -> None:
     def needs(*methods: str) -> dict[str, set[str]]:
-        jobs = _plan(tmp_path, *(RunSpec(TOY, method, 0) for method in methods))
+        jobs = _plan(tmp_path, *(RunSpec(TINY.id, method, 0) for method in methods))
         return {job.title: {needed.title for needed in job.needs} for job in jobs}
 
-    scenario = load_scenario(TOY)
-    skills = {f"Toy-v0 demonstrations {task.name}" for task in scenario.retained}
-    targets = {f"Toy-v0 demonstrations {task.name}" for task in scenario.target}
+    skills = {f"me--Tiny-v0 demonstrations {task.name}" for task in TINY.retained}
+    targets = {f"me--Tiny-v0 demonstrations {task.name}" for task in TINY.target}
     policy, questions, start, sft, joint = (
-        f"Toy-v0 {name}"
+        f"me--Tiny-v0 {name}"
         for name in (
             "pretraining seed 0",
             "questions",
@@ -363,21 +362,21 @@ def test_a_run_waits_for_the_data_that_it_needs_and_no_other_data_is_made(
     assert found[sft] == {policy, questions, start} | targets
     assert found[joint] == {policy, questions, start} | targets | skills
     assert set(found) == {sft, joint} | found[joint]
-    pretrained_policy(scenario, 0)
+    pretrained_policy(TINY, 0)
     assert needs("sft")[start] == {questions}
-    evaluate_pretrained(RunSpec(TOY, "joint", 0).resolve())
+    evaluate_pretrained(RunSpec(TINY.id, "joint", 0).resolve())
     assert needs("sft") == {sft: {questions} | targets, questions: set(), **{name: set() for name in targets}}
     demonstrated = {path.parent.name for path in (empty_caches / "minari").rglob("data")}
-    execute(RunSpec(TOY, "sft", 0), tmp_path)  # it never reads demonstrations of the skills, so makes none
+    execute(RunSpec(TINY.id, "sft", 0), tmp_path)  # it never reads demonstrations of the skills: makes none
     after = {path.parent.name for path in (empty_caches / "minari").rglob("data")}
-    assert after - demonstrated == {f"{task.name}-v0" for task in scenario.target}
+    assert after - demonstrated == {f"{task.name}-v0" for task in TINY.target}
 
 
 @pytest.mark.long
 def test_one_worker_and_two_make_equal_records_and_a_stopped_benchmark_continues(
     tmp_path: Path, bars: Bars, lasting_records: Callable[[Path], dict[str, Any]]
 ) -> None:
-    specs = [RunSpec(TOY, method, 0, targets=1) for method in ("frozen", "sft", "joint")]
+    specs = [RunSpec(f"tiny:{TINY.id}", method, 0, targets=1) for method in ("frozen", "sft", "joint")]
     assert run_jobs(_plan(tmp_path / "one", *specs), Processes(1), bars) == {}
     assert run_jobs(_plan(tmp_path / "two", *specs[:1]), Processes(2), bars) == {}
     missing = [spec for spec in specs if not has_record(spec.resolve(), tmp_path / "two")]

@@ -18,11 +18,9 @@ from clbench.policy.policy import Policy
 from clbench.policy.transformer import TransformerPolicy
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
-from clbench.testing import TOY
 
-ID = "clbench.testing:clbench/Toy-v0"
-STEPS = TOY.budget.adaptation_steps
-BATCH = TOY.budget.batch_size
+STEPS = TINY.budget.adaptation_steps
+BATCH = TINY.budget.batch_size
 
 
 def train(policy: Policy, batches: Any, steps: int) -> None:
@@ -130,7 +128,7 @@ SOURCES: list[Any] = []
 def test_steps_outside_of_the_loop_are_counted(
     method: type[Method], more: int, stranger: Callable[[type[Method]], str], tmp_path: Path
 ) -> None:
-    record = execute(RunSpec(ID, stranger(method), seed=0), tmp_path)
+    record = execute(RunSpec(TINY.id, stranger(method), seed=0), tmp_path)
     assert record.costs.optimiser_steps == 2 * STEPS + more
 
 
@@ -138,7 +136,7 @@ def test_steps_outside_of_the_loop_are_counted(
 def test_a_buffer_that_the_method_added_is_kept_data(
     stranger: Callable[[type[Method]], str], tmp_path: Path
 ) -> None:
-    record = execute(RunSpec(ID, stranger(Hiding), seed=0), tmp_path)
+    record = execute(RunSpec(TINY.id, stranger(Hiding), seed=0), tmp_path)
     assert record.costs.bytes_kept == 16 * 4
 
 
@@ -221,7 +219,7 @@ def test_a_method_is_told_what_it_did_wrong(
     tmp_path: Path,
 ) -> None:
     SOURCES.clear()
-    record = execute(RunSpec(ID, stranger(method), seed=0), tmp_path)
+    record = execute(RunSpec(TINY.id, stranger(method), seed=0), tmp_path)
     assert record.error is not None
     assert record.error["where"] == where
     assert message in record.error["message"]

@@ -33,6 +33,7 @@ from clbench.runs.stages import MachineError, make_stages
 from clbench.scoring.scores import Scores
 
 TOY = "clbench.testing:clbench/Toy-v0"
+TYPED = f"tiny:{TINY.id}"
 
 DEADLY = """
 import dataclasses, os, signal
@@ -96,7 +97,7 @@ def test_a_full_disk_is_no_failure_of_the_method(tmp_path: Path) -> None:
 def test_an_error_of_the_file_system_inside_a_hook_is_a_failure_of_the_method(
     tmp_path: Path, stranger: Callable[[type[Method]], str]
 ) -> None:
-    record = execute(RunSpec(TOY, stranger(_Raises), seed=0), tmp_path)
+    record = execute(RunSpec(TINY.id, stranger(_Raises), seed=0), tmp_path)
     assert record.error is not None
     assert record.error["type"] == "FileNotFoundError"
     assert record.error["where"] == "prepare"
@@ -147,7 +148,7 @@ class _Interrupts(Method):
 def test_an_interrupt_is_the_methods_where_ctrl_c_is_ignored_and_the_users_elsewhere(
     tmp_path: Path, stranger: Callable[[type[Method]], str]
 ) -> None:
-    spec = RunSpec(TOY, stranger(_Interrupts), seed=0)
+    spec = RunSpec(TINY.id, stranger(_Interrupts), seed=0)
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         record = execute(spec, tmp_path)
@@ -188,7 +189,7 @@ class _Reads(_Writes):
 def test_a_full_disk_or_a_failing_network_is_not_the_methods_fault_and_leaves_no_record(
     tmp_path: Path, stranger: Callable[[type[Method]], str], cls: type[Method], fault: str
 ) -> None:
-    spec = RunSpec(TOY, stranger(cls), seed=0)
+    spec = RunSpec(TINY.id, stranger(cls), seed=0)
     match = f"{fault}. The method is not to blame"
     with pytest.raises(MachineError, match=match):
         execute(spec, tmp_path)
@@ -200,7 +201,7 @@ def test_a_full_disk_or_a_failing_network_is_not_the_methods_fault_and_leaves_no
 def test_a_method_that_exits_is_named_with_its_hook(
     tmp_path: Path, stranger: Callable[[type[Method]], str]
 ) -> None:
-    record = execute(RunSpec(TOY, stranger(_Exits), seed=0), tmp_path)
+    record = execute(RunSpec(TINY.id, stranger(_Exits), seed=0), tmp_path)
     assert record.error is not None
     assert record.error["where"] == "end_task() of stage 1 (right)"
     assert record.error["message"] == "The hook raised SystemExit(3)."
@@ -223,7 +224,7 @@ def test_a_method_that_kills_its_process_is_named_with_its_hook(
 ) -> None:
     write_module("deadly", DEADLY.format(death=death))
     with pytest.raises(SystemExit):
-        resolve("clbench.cli.runs:run")(TOY, "deadly:Deadly", seeds=1, records=tmp_path / "records")
+        resolve("clbench.cli.runs:run")(TYPED, "deadly:Deadly", seeds=1, records=tmp_path / "records")
     said = capsys.readouterr().err
     assert f"its process ended in stage 1 (right) without a result ({end})" in said
     assert "0 of 1 run in 0." in said
@@ -253,8 +254,8 @@ def test_a_run_that_fails_leaves_a_good_record_of_another_configuration_alone(
 def test_a_damaged_record_is_named_set_aside_and_made_again(
     tmp_path: Path, damage: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = RunSpec(TOY, "frozen", seed=0).path(tmp_path)
-    record = execute(RunSpec(TOY, "frozen", seed=0), tmp_path)
+    path = RunSpec(TINY.id, "frozen", seed=0).path(tmp_path)
+    record = execute(RunSpec(TINY.id, "frozen", seed=0), tmp_path)
     if damage == "torn":
         path.write_text("{", encoding="utf-8")
     else:
@@ -262,10 +263,10 @@ def test_a_damaged_record_is_named_set_aside_and_made_again(
             del column[-1]
         write_record(record, path)
     damaged = path.read_bytes()
-    resolve("clbench.cli.runs:run")(TOY, "frozen", seeds=1, records=tmp_path)
+    resolve("clbench.cli.runs:run")(TYPED, "frozen", seeds=1, records=tmp_path)
     said = capsys.readouterr().err
     assert f"{path.name}.damaged, and the run is repeated." in said
-    assert ("cannot be read as JSON" if damage == "torn" else "is missing at stage 2, step 60") in said
+    assert ("cannot be read as JSON" if damage == "torn" else "is missing at stage 2, step 8") in said
     assert path.with_name(f"{path.name}.damaged").read_bytes() == damaged
     assert Scores.from_record(read_record(path)).success.shape[0] == 3
 
@@ -273,7 +274,7 @@ def test_a_damaged_record_is_named_set_aside_and_made_again(
 def test_a_record_of_a_newer_clbench_stays_where_it_is(
     tmp_path: Path, stranger: Callable[[type[Method]], str]
 ) -> None:
-    spec = RunSpec(TOY, "frozen", seed=0, targets=1)
+    spec = RunSpec(TINY.id, "frozen", seed=0, targets=1)
     path = spec.path(tmp_path)
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps({"schema": SCHEMA + 1}))
@@ -281,7 +282,7 @@ def test_a_record_of_a_newer_clbench_stays_where_it_is(
     for refuses in (has_record, set_aside):
         with pytest.raises(UnreadableRecordError, match=f"newer than {SCHEMA}: update clbench"):
             refuses(spec.resolve(), tmp_path)
-    failed = execute(RunSpec(TOY, stranger(_Raises), seed=0), tmp_path / "other")
+    failed = execute(RunSpec(TINY.id, stranger(_Raises), seed=0), tmp_path / "other")
     assert failed.status == "failed"
     write_result(failed, path)
     assert path.read_bytes() == newer

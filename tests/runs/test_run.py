@@ -30,6 +30,7 @@ from clbench.testing import ToyWorld
 pytestmark = pytest.mark.long
 
 TOY = "clbench.testing:clbench/Toy-v0"
+STEPS = TINY.budget.adaptation_steps
 
 
 def _lasting(path: Path) -> dict[str, Any]:
@@ -136,11 +137,11 @@ def test_all_methods_have_the_same_initial_states_and_the_same_pretrained_policy
 
 
 def test_a_run_in_another_order_begins_with_the_same_policy_states_and_simulator(tmp_path: Path) -> None:
-    specs = [RunSpec(TOY, "frozen", seed=0, order=order) for order in range(2)]
+    specs = [RunSpec(TINY.id, "frozen", seed=0, order=order) for order in range(2)]
     published, other = (execute(spec, tmp_path) for spec in specs)
     assert (published.scenario.target, other.scenario.target) == (["right", "down"], ["down", "right"])
     assert (published.run.order, other.run.order) == (0, 1)
-    assert specs[1].path(tmp_path) == tmp_path / "Toy-v0" / "frozen" / "seed-0-order-1.json"
+    assert specs[1].path(tmp_path) == tmp_path / "me--Tiny-v0" / "frozen" / "seed-0-order-1.json"
     assert all(has_record(spec.resolve(), tmp_path) for spec in specs)
     assert published.fingerprint == other.fingerprint  # the hash of the pretrained policy is in it
     starts, others = (
@@ -210,10 +211,10 @@ def test_a_scenario_that_cannot_be_perturbed_is_refused_before_any_work(
 
 
 def test_frozen_forgets_nothing_and_costs_nothing(tmp_path: Path) -> None:
-    record = execute(RunSpec(TOY, "frozen", seed=0), tmp_path)
+    record = execute(RunSpec(TINY.id, "frozen", seed=0), tmp_path)
     rows = list(zip(*record.episodes.values(), strict=True))
     tested = [row for row in rows if row[3] == "test"]
-    ends = [{row[2:]: row for row in tested if row[:2] == (stage, 60 * bool(stage))} for stage in range(3)]
+    ends = [{row[2:]: row for row in tested if row[:2] == (stage, STEPS * bool(stage))} for stage in range(3)]
     assert set(record.policy["update_sparsity"]) == {1.0}
     assert set(record.policy["activation_drift"]) == {0.0}
     assert [set(end) for end in ends] == [set(ends[0])] * 3
@@ -281,34 +282,34 @@ class Merging(Method):
 def test_a_method_of_whole_stages_is_evaluated_only_at_their_ends(
     tmp_path: Path, stranger: Callable[[type[Method]], str]
 ) -> None:
-    record = execute(RunSpec(TOY, stranger(Merging), seed=0), tmp_path)
-    assert set(record.episodes["step"]) == {0, 60}
-    other = execute(RunSpec(TOY, "sft", seed=0), tmp_path)
+    record = execute(RunSpec(TINY.id, stranger(Merging), seed=0), tmp_path)
+    assert set(record.episodes["step"]) == {0, STEPS}
+    other = execute(RunSpec(TINY.id, "sft", seed=0), tmp_path)
     assert Scores.from_record(record).layout == Scores.from_record(other).layout
     assert set(record.policy["update_sparsity"]) == {1.0}  # with a learning rate of 0 nothing moves
 
 
 def test_the_steps_of_the_preparation_count(tmp_path: Path, stranger: Callable[[type[Method]], str]) -> None:
-    record = execute(RunSpec(TOY, stranger(Merging), seed=0, targets=1), tmp_path)
-    assert (record.costs.preparation_steps, record.costs.optimiser_steps) == (7, 7 + 60)
+    record = execute(RunSpec(TINY.id, stranger(Merging), seed=0, targets=1), tmp_path)
+    assert (record.costs.preparation_steps, record.costs.optimiser_steps) == (7, 7 + STEPS)
 
 
 def test_a_tuning_run_never_plays_a_test_episode(tmp_path: Path) -> None:
-    record = execute(RunSpec(TOY, "sft", seed=0, split="validation", targets=1), tmp_path)
+    record = execute(RunSpec(TINY.id, "sft", seed=0, split="validation", targets=1), tmp_path)
     assert set(record.episodes["split"]) == {"validation"}
     assert record.run.split == "validation"
-    assert not has_record(RunSpec(TOY, "sft", seed=0, targets=1).resolve(), tmp_path)
-    tested = execute(RunSpec(TOY, "sft", seed=0, targets=1), tmp_path / "test")
+    assert not has_record(RunSpec(TINY.id, "sft", seed=0, targets=1).resolve(), tmp_path)
+    tested = execute(RunSpec(TINY.id, "sft", seed=0, targets=1), tmp_path / "test")
     assert record.fingerprint["pretrained"] == tested.fingerprint["pretrained"]
     # the training is the same: both runs end with the same policy
     assert record.policy["update_sparsity"] == tested.policy["update_sparsity"]
 
 
 def test_a_run_with_changes_records_them_and_has_its_own_file(tmp_path: Path) -> None:
-    record = execute(RunSpec(TOY, "experience_replay", 0, {"replay": "0.25"}, targets=1), tmp_path)
+    record = execute(RunSpec(TINY.id, "experience_replay", 0, {"replay": "0.25"}, targets=1), tmp_path)
     assert record.run.changes == {"replay": 0.25}
     assert record.run.settings == {"replay": 0.25, "step_factor": 1.0}
-    assert [path.name for path in (tmp_path / "Toy-v0").iterdir()] == ["experience_replay+replay=0.25"]
+    assert [path.name for path in (tmp_path / "me--Tiny-v0").iterdir()] == ["experience_replay+replay=0.25"]
 
 
 @dataclasses.dataclass
@@ -405,7 +406,7 @@ class _Boasts(Method):
 def test_a_method_that_fails_leaves_a_record_that_names_the_place(
     tmp_path: Path, stranger: Callable[[type[Method]], str], cls: type[Method], where: str, message: str
 ) -> None:
-    spec = RunSpec(TOY, stranger(cls), seed=0)
+    spec = RunSpec(TINY.id, stranger(cls), seed=0)
     execute(spec, tmp_path)
     record = read_record(spec.path(tmp_path))
     assert record.status == "failed"

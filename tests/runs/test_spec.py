@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tiny import TINY
 
 from clbench.base.errors import ClbenchError, InputError, UnknownNameError
 from clbench.runs.run import execute
@@ -29,12 +30,12 @@ def test_a_run_looks_up_one_scenario_and_one_method(tmp_path: Path, monkeypatch:
 
         return count
 
-    execute(RunSpec(TOY, "sft", 0, targets=1), str(tmp_path / "first"))  # fills the cache
+    execute(RunSpec(TINY.id, "sft", 0, targets=1), str(tmp_path / "first"))  # fills the cache
     for module in [one for name, one in sys.modules.items() if name.startswith("clbench.")]:
         for name in counts:
             if name in vars(module):
                 monkeypatch.setattr(module, name, counted(name, getattr(module, name)))
-    execute(RunSpec(TOY, "sft", 0, targets=1), tmp_path / "second")
+    execute(RunSpec(TINY.id, "sft", 0, targets=1), tmp_path / "second")
     assert counts == {"_scenario_at": 1, "load_method": 1}
 
 
