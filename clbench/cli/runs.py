@@ -194,6 +194,7 @@ def score(
         "records": records,
     }
     with checked_input():
+        check_folders({"--records": records})
         if is_scored(scenario, **options):
             print_plain(console, f"Stage {stage} of {method}, seed {seed}, is done.")
             return

@@ -124,12 +124,12 @@ def status(
 
 def _state_of(run: ResolvedRun, records: Path) -> RunState:
     """Return the state of a run that was asked for: a record of other settings is not its record."""
-    from clbench.jobs.recorded import has_code_of, has_settings_of
+    from clbench.jobs.recorded import changed_code, has_settings_of
     from clbench.scoring.scores import Scores
 
     def is_wanted(record: Record) -> bool:
         here = replace(record.run, device=run.info.device)  # the device is not asked for
-        return has_settings_of(replace(record, run=here), run) and has_code_of(record, run)
+        return has_settings_of(replace(record, run=here), run) and not changed_code(record, run)
 
     return run_state(run.path(records), Scores.from_record, is_wanted)
 

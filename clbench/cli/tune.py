@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from clbench.base.errors import InputError
-from clbench.base.text import counted
+from clbench.base.text import counted, print_plain
 from clbench.cli.arguments import (
     MethodName,
     ScenarioId,
@@ -59,7 +59,8 @@ def tune(
 
     Each method runs with four learning rates, then with two values of its own strength at the best of them,
     or with two more learning rates. Runs learn all targets, with seeds that no board uses, and play no
-    test episodes. Of the settings with `learned` of at least 0.8, the one with the best final average wins.
+    test episodes. Of the settings with `learned` of at least 0.8, the one with the best final average wins. A
+    setting with a failed run, for example because the loss diverged, is not chosen.
     Runs with a record are skipped: repeat a stopped command to continue it, or to see the choice again.
 
     With --values the methods run with every combination of these values instead, besides plain fine-tuning,
@@ -85,7 +86,7 @@ def tune(
     check_names([scenario], methods)
     from clbench.learning.registry import load_method
     from clbench.runs.spec import RunSpec, check_device
-    from clbench.runs.tuning import CONTROLS, check_tuned, rungs, write_tuned
+    from clbench.runs.tuning import CONTROLS, check_tuned, rungs, tuned_file, write_tuned
 
     if targets is not None:  # a run of fewer targets must not replace the record of all
         records = records / f"targets-{targets}"
@@ -129,6 +130,14 @@ def tune(
     if write is not None:
         with checked_input():
             write_tuned(write, without_module(scenario), numbers, chosen)
+        read = tuned_file(without_module(scenario))
+        if write.resolve() != read.resolve():
+            copy = f"copy {write} there, on every machine that runs or shows these records."
+            print_plain(Console(stderr=True), f"`clbench run` reads {read}: {copy}")
+    if len(chosen) < len(names):
+        without = ", ".join(name for name in names if name not in chosen)
+        print_plain(Console(stderr=True), f"All first four settings failed: {without}.", "bold red")
+        sys.exit(1)
 
 
 def _choose(
@@ -136,16 +145,23 @@ def _choose(
     ladder: Mapping[str, Sequence[Settings]],
     run: Callable[[Mapping[str, Sequence[Settings]]], dict[str, list[Tried]]],
 ) -> dict[str, Tuned]:
-    """Try the learning rates of each method, then its refinements at the best of them; return the choices."""
+    """Try the learning rates of each method, then its refinements at the best of them.
+
+    Returns:
+        The choice for each method, except those that failed at every learning rate.
+    """
     from clbench.runs.tuning import Tuned, best_of, refinements
 
-    begun = run(ladder)
-    refined = run({name: refinements(cls, best_of(begun[name]).settings) for name, cls in classes.items()})
-    chosen = {}
-    for name in classes:
-        tried = (*begun[name], *refined[name])
-        chosen[name] = Tuned(best_of(tried).settings, tried)
-    return chosen
+    begun = {
+        name: tried
+        for name, tried in run(ladder).items()
+        if any(one.final_average is not None for one in tried)
+    }
+    refined = run(
+        {name: refinements(classes[name], best_of(tried).settings) for name, tried in begun.items()}
+    )
+    every = {name: (*tried, *refined[name]) for name, tried in begun.items()}
+    return {name: Tuned(best_of(tried).settings, tried) for name, tried in every.items()}
 
 
 def _besides(name: str, combinations: list[dict[str, str]]) -> list[dict[str, str]]:
@@ -179,15 +195,17 @@ def _run(
 ) -> dict[str, list[Tried]]:
     """Do the runs of all settings that have no record, and return the scores of each setting."""
     from clbench.jobs.processes import Processes
+    from clbench.jobs.recorded import has_failed, has_record
 
     with checked_input():
         runs = {
             name: _resolved(replace(first, method=name), settings, seeds) for name, settings in wanted.items()
         }
     every = [one for groups in runs.values() for group in groups for one in group]
-    if not do_runs(every, records, lambda: Processes(workers)):
-        sys.exit(1)
+    succeeded = do_runs(every, records, lambda: Processes(workers))
     with checked_input():
+        if not succeeded and not all(has_failed(one, records) or has_record(one, records) for one in every):
+            sys.exit(1)  # the machine failed, not a method: the same command goes on
         return {name: [_tried(group, records) for group in groups] for name, groups in runs.items()}
 
 
@@ -204,7 +222,10 @@ def _tried(runs: Sequence[ResolvedRun], records: Path) -> Tried:
     from clbench.scoring.metrics import measure
     from clbench.scoring.scores import Scores
 
-    scores = [Scores.from_record(read_record(run.path(records))) for run in runs]
+    found = [read_record(run.path(records)) for run in runs]
+    if any(record.status == "failed" for record in found):
+        return Tried(dict(runs[0].changes), None, None)
+    scores = [Scores.from_record(record) for record in found]
 
     def mean(metric: str) -> float:
         values = [measure(metric, one) for one in scores]
@@ -233,7 +254,8 @@ def _table(scenario: str, found: Mapping[str, tuple[Settings | None, Sequence[Tr
         table.add_section()
         for tried in every:
             style = "bold" if tried.settings == chosen else ""
-            values = f"{tried.learned:.2f}", f"{tried.final_average:.3f}"
+            scores = (tried.learned, ".2f"), (tried.final_average, ".3f")
+            values = ["failed" if score is None else format(score, form) for score, form in scores]
             table.add_row(name, _words(tried.settings), *values, style=style)
     return table
 

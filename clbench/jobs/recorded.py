@@ -14,6 +14,7 @@ from clbench.records.reader import RecordError, UnreadableRecordError, read_reco
 from clbench.records.record import Record
 from clbench.runs.spec import ResolvedRun
 from clbench.scoring.scores import Scores
+from clbench.spec.policies import policy_source
 from clbench.spec.scenario import Scenario
 
 
@@ -21,7 +22,7 @@ def has_record(run: ResolvedRun, records: Path) -> bool:
     """Return whether exactly this run has completed, or the same run with perturbed episodes.
 
     A record does not count if its run failed, if it cannot be read or contradicts itself, if its budget,
-    device or settings differ, or if the code of a method "module:Class" has changed since.
+    device or settings differ, or if the code of a method or policy "module:Class" has changed since.
 
     Raises:
         InputError: The record was made with another definition of the scenario.
@@ -35,7 +36,7 @@ def has_record(run: ResolvedRun, records: Path) -> bool:
         raise
     except RecordError:
         return False
-    if record.status != "success" or not has_settings_of(record, run) or not has_code_of(record, run):
+    if record.status != "success" or not has_settings_of(record, run) or changed_code(record, run):
         return False
     _check_definition(record, run.published, path)
     return True
@@ -53,11 +54,11 @@ def has_failed(run: ResolvedRun, records: Path) -> bool:
         record = read_record(run.path(records))
     except RecordError:
         return False
-    return record.status == "failed" and has_settings_of(record, run) and has_code_of(record, run)
+    return record.status == "failed" and has_settings_of(record, run) and not changed_code(record, run)
 
 
 def set_aside(run: ResolvedRun, records: Path) -> str | None:
-    """Rename the record of a run if it is damaged, or of older code of its method, to do the run again.
+    """Rename the record of a run if it is damaged, or of older code, to do the run again.
 
     Returns:
         A sentence that says what was wrong and where the record is now; None if there is no such record.
@@ -77,9 +78,10 @@ def set_aside(run: ResolvedRun, records: Path) -> str | None:
     except RecordError as error:
         fault, ending = str(error).removeprefix(f"{path}: ").rstrip("."), "damaged"
     else:
-        if record.status != "success" or has_code_of(record, run):
+        changed = changed_code(record, run)
+        if record.status != "success" or not changed:
             return None
-        fault, ending = f"the code of {run.spec.method} has changed since", "old"
+        fault, ending = f"the code of {' and '.join(changed)} has changed since", "old"
     names = (path.with_name(f"{path.name}.{ending}{number or ''}") for number in itertools.count())
     aside = next(one for one in names if not os.path.lexists(one))
     with contextlib.suppress(FileNotFoundError):  # another command was faster
@@ -87,17 +89,21 @@ def set_aside(run: ResolvedRun, records: Path) -> str | None:
     return f"{path}: {fault}. It is renamed to {aside.name}, and the run is repeated."
 
 
-def has_code_of(record: Record, run: ResolvedRun) -> bool:
-    """Return whether a record is of the code that its method has now.
+def changed_code(record: Record, run: ResolvedRun) -> list[str]:
+    """Return the names of the method and the policy, if their code is not that of a record any more.
 
-    Methods with a name of their own have versions; those of a module are work in progress.
+    Methods with a name of their own have versions; what is named "module:Class" is work in progress.
     """
-    if ":" not in run.spec.method:
-        return True
     from clbench.learning.registry import describe_method
 
+    changed, method, policy = [], run.spec.method, run.spec.policy
     recorded = record.fingerprint.get("method")
-    return isinstance(recorded, dict) and recorded.get("source") == describe_method(run.method)["source"]
+    source = recorded.get("source") if isinstance(recorded, dict) else None
+    if ":" in method and source != describe_method(run.method)["source"]:
+        changed.append(method)
+    if ":" in policy and record.fingerprint.get("policy") != policy_source(policy):
+        changed.append(policy)
+    return changed
 
 
 def _check_definition(record: Record, published: Scenario, path: Path) -> None:

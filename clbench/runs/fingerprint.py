@@ -112,6 +112,12 @@ def _hardware(device: str) -> dict[str, str]:
     }
 
 
+def arithmetic(device: str) -> dict[str, str]:
+    """Return the hardware that decides the bits of a run: one that changes it midway cannot be repeated."""
+    hardware = _hardware(device)
+    return {name: hardware[name] for name in ("gpu", "machine", "instructions") if name in hardware}
+
+
 def _processor() -> str:
     """Return the model of the processor."""
     try:

@@ -196,6 +196,9 @@ def check_device(device: str) -> None:
     import torch
 
     try:
+        found = torch.device(device)
+        if found.type == "cuda" and (found.index or 0) < torch.cuda.device_count():
+            return  # a tensor there would hold a context, which locks a GPU in exclusive mode for the workers
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).partition("\n")[0].partition(". ")[0]  # PyTorch goes on for pages

@@ -53,10 +53,10 @@ class Tried:
 
     settings: dict[str, Any]
     """Hyper-parameters that tuning sets, by name."""
-    final_average: float
-    """Success after the last target on everything that was ever trained."""
-    learned: float
-    """Success on each target right after it was learned."""
+    final_average: float | None
+    """Success after the last target on everything that was ever trained; None if a run failed."""
+    learned: float | None
+    """Success on each target right after it was learned; None if a run failed."""
 
 
 @dataclass(frozen=True)
@@ -94,18 +94,19 @@ def refinements(method: type[Method], best: Settings) -> list[dict[str, Any]]:
 def best_of(tried: Sequence[Tried]) -> Tried:
     """Return the setting with the best final average among those that learn enough.
 
-    If none learns enough, it is the one that learns most. The first one wins a tie.
+    If none learns enough, it is the one that learns most. The first one wins a tie. A setting with a run that
+    failed is not chosen; one at least must have succeeded.
     """
     return rated_best(tried)[0]
 
 
 def rated_best(tried: Sequence[Tried]) -> list[Tried]:
     """Return the setting that `best_of` chooses, and those with the same score after it."""
-    learners = [one for one in tried if one.learned >= LEARNED]
+    learners = [one for one in tried if (one.learned or 0.0) >= LEARNED]
     if not learners:
-        most = max(one.learned for one in tried)
+        most = max(one.learned or 0.0 for one in tried)
         return [one for one in tried if one.learned == most]
-    best = max(one.final_average for one in learners)
+    best = max(one.final_average or 0.0 for one in learners)
     return [one for one in learners if one.final_average == best]
 
 

@@ -96,7 +96,9 @@ def lerobot_policy(
         torch.manual_seed(int(observations["seed"].sum() + observations["step"].sum()))
         with torch.no_grad():
             chunks = policy.predict_action_chunk(preprocess(batch))
-            steps = [postprocess(chunks[:, step]) for step in range(chunks.shape[1])]
+            # LeRobot executes so many actions of a chunk, then the policy acts again
+            executed = getattr(policy.config, "n_action_steps", chunks.shape[1])
+            steps = [postprocess(chunks[:, step]) for step in range(min(executed, chunks.shape[1]))]
             actions: NDArray[Any] = torch.stack(steps, dim=1).float().cpu().numpy()
         return actions
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from clbench.base.entry_points import is_entry_point, unknown
 from clbench.base.errors import InputError, WrongTypeError
-from clbench.base.source import package_of
+from clbench.base.source import package_of, source_hash
 from clbench.spec.identifiers import LONGEST
 
 POLICIES = {
@@ -77,3 +77,9 @@ def check_policy_name(name: str) -> None:
 def policy_packages(policy: str) -> list[str]:
     """Return the package, or module, of a policy that is not built in."""
     return [] if is_built_in(policy) else [package_of(policy)]
+
+
+def policy_source(policy: str) -> str | None:
+    """Return the hash of the code of a policy's package, or module; None if the policy is built in."""
+    packages = policy_packages(policy)
+    return source_hash(*packages) if packages else None

@@ -11,6 +11,7 @@ from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, groupby
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -94,6 +95,7 @@ def compute_board(records: Path, only: Container[str] | None = None) -> Board:
         scenarios={run.table: run.published for run in runs},
         rows=tuple(chain.from_iterable(found)),
         starts={name: pretrained_success(rows) for name, rows in by_name.items()},
+        unpaired={name: others for name, rows in by_name.items() if (others := unpaired(rows))},
         agreements={name: agreement(rows) for name, rows in by_name.items()},
         not_shown=tuple(sorted([*not_shown, *alone, *without], key=lambda entry: entry.path)),
         frontiers=frontiers_of(ladder),
@@ -192,6 +194,25 @@ def pretrained_success(rows: Iterable[Row]) -> float | None:
     rates = [run.record.retained_at_start() for run in row.runs]
     known = [rate for rate in rates if rate is not None]
     return statistics.fmean(known) if known else None
+
+
+def unpaired(rows: Iterable[Row]) -> dict[str, list[int]]:
+    """Return the seeds of runs that began with another pretrained policy than plain fine-tuning, by method.
+
+    On processors with other instructions, pretraining ends with other weights. Differences by seed then
+    compare runs that have only their initial states in common.
+    """
+    begins: dict[str, dict[int, Any]] = {
+        row.method: {run.seed: run.record.fingerprint.get("pretrained") for run in row.runs}
+        for row in rows
+        if row.division not in ELSEWHERE
+    }
+    usual = begins.get(BASELINE, {})
+    found = {
+        method: [seed for seed, policy in seeds.items() if policy != usual.get(seed, policy)]
+        for method, seeds in begins.items()
+    }
+    return {method: seeds for method, seeds in found.items() if seeds}
 
 
 def mean_difference(metric: str, runs: Runs, others: Runs) -> float | None:

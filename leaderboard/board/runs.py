@@ -338,11 +338,21 @@ def same_settings(runs: list[Run]) -> Sifted:
 
 
 def _learner(run: Run) -> dict[str, Any]:
-    """Return the class of an agent that learned by trial: two that share a name make no row together."""
-    method = run.record.fingerprint.get("method")
-    if run.division != "online" or not isinstance(method, dict):
-        return {}
-    return {"class of the agent": method.get("class")}
+    """Return what the names of an agent, a method "module:Class" and a policy "module:Class" leave open.
+
+    Two agents that share a name make no row together, and neither do seeds of code that changed between them.
+    """
+    made, info = run.record.fingerprint, run.record.run
+    method = made.get("method")
+    known = method if isinstance(method, dict) else {}
+    learner: dict[str, Any] = {}
+    if run.division == "online":
+        learner["class of the agent"] = known.get("class")
+    elif ":" in info.method:
+        learner["code of the method"] = known.get("source")
+    if ":" in info.policy:
+        learner["code of the policy"] = made.get("policy")
+    return learner
 
 
 ALIKE: tuple[Sift, ...] = (same_scenario, same_definition, same_simulator, same_layout, same_settings)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol, TypeVar
 
@@ -92,6 +92,9 @@ class Summary:
     """Rows by scenario and division, the best first; scenarios with a criterion come first."""
     starts: Mapping[str, float | None] = field(default_factory=dict)
     """Mean success of the pretrained policy on its skills, by scenario."""
+    unpaired: Mapping[str, Mapping[str, Sequence[int]]] = field(default_factory=dict)
+    """Seeds with which runs began with another pretrained policy than plain fine-tuning, by scenario and
+    method."""
     agreements: Mapping[str, Concordance | None] = field(default_factory=dict)
     """How alike the seeds order the rows, by scenario."""
     not_shown: tuple[NotShown, ...] = ()
@@ -102,6 +105,7 @@ class Summary:
         return {
             "rows": [_row_to_json(row) for row in self.rows],
             "starts": dict(self.starts),
+            "unpaired": {name: dict(found) for name, found in self.unpaired.items()},
             "agreements": {name: found and asdict(found) for name, found in self.agreements.items()},
             "not_shown": [asdict(entry) for entry in self.not_shown],
         }
@@ -116,6 +120,7 @@ class Summary:
         return Summary(
             rows=tuple(_row_from_json(row) for row in values["rows"]),
             starts=values["starts"],
+            unpaired=values["unpaired"],
             agreements={name: found and Concordance(**found) for name, found in values["agreements"].items()},
             not_shown=tuple(NotShown(**entry) for entry in values["not_shown"]),
         )

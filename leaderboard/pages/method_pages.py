@@ -77,10 +77,10 @@ class Tried:
     """Scenario that it was tried on."""
     settings: str
     """Hyper-parameters that tuning sets."""
-    learned: float
-    """Success on each target right after it was learned."""
-    final_average: float
-    """Success after the last target on everything that was ever trained."""
+    learned: float | None
+    """Success on each target right after it was learned; None if a run failed."""
+    final_average: float | None
+    """Success after the last target on everything that was ever trained; None if a run failed."""
     chosen: bool
     """Whether tuning chose it."""
 

@@ -6,7 +6,7 @@ The same rows give the same bytes: no date, no absolute path, fixed digits.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -132,6 +132,21 @@ def start_text(rate: float | None) -> str:
         return ""
     sentence = f"The pretrained policy succeeds in {number_text(rate, '.2f')} of the episodes of its skills."
     return sentence if rate >= WEAK else f"{sentence} {WEAK_WARNING}"
+
+
+def unpaired_text(found: Mapping[str, Sequence[int]] | None) -> str:
+    """Return a sentence on methods whose runs did not begin like plain fine-tuning; empty if all did.
+
+    Args:
+        found: See `Summary.unpaired`.
+    """
+    if not found:
+        return ""
+    names = "; ".join(f"{method} (seeds {', '.join(map(str, seeds))})" for method, seeds in found.items())
+    return (
+        f"These runs began with another pretrained policy than sft's: {names}. Their gain compares unlike "
+        "runs: to mend it, run sft on the same kind of processor, with --records in a folder of its own."
+    )
 
 
 def agreement_text(found: Concordance | None) -> str:

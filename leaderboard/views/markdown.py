@@ -38,6 +38,7 @@ from .format import (
     start_text,
     tiers_text,
     title_of,
+    unpaired_text,
 )
 
 _ARXIV = re.compile(r"arXiv (\d{4}\.\d{5})")
@@ -70,6 +71,7 @@ def markdown(board: Board, comparisons: Comparisons) -> str:
         counted=counted,
         policy_of=lambda table: table_parts(table)[1],
         start_text=start_text,
+        unpaired_text=unpaired_text,
         tiers_text=tiers_text,
         prediction_text=prediction_text,
         letters_of=letters_of,

@@ -18,7 +18,18 @@ from clbench.scoring.metrics import METRICS
 from ..board.overall import OverallRow, overall
 from ..board.summary import RowSummary, Summary, divisions_of, tables_of
 from ..board.tiers import TIERS
-from .format import MISSING, Column, Rows, agreement_text, aligned, fitting, number_text, scaled, start_text
+from .format import (
+    MISSING,
+    Column,
+    Rows,
+    agreement_text,
+    aligned,
+    fitting,
+    number_text,
+    scaled,
+    start_text,
+    unpaired_text,
+)
 
 LEGEND = (
     "Rows of a division that share a letter are not told apart. "
@@ -81,7 +92,11 @@ def terminal(table: Summary, width: int = 108, sort: str | None = None) -> Rende
     for scenario, rows in tables_of(table.rows).items():
         tables.append(rows)
         parts += _fitted(scenario, _sorted(rows, sort), _heads(rows), width)
-        sentences = (start_text(table.starts.get(scenario)), agreement_text(table.agreements.get(scenario)))
+        sentences = (
+            start_text(table.starts.get(scenario)),
+            unpaired_text(table.unpaired.get(scenario)),
+            agreement_text(table.agreements.get(scenario)),
+        )
         parts += [Text(sentence) for sentence in sentences if sentence]
         parts.append(Text())
     over_scenarios = overall(table.rows)

@@ -7,12 +7,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from tiny import TINY
 from verification import failures, verify
 
 from clbench import load_scenario
 from clbench.base.errors import InputError
 from clbench.cli.main import app
 from clbench.cli.scaffold import class_name, write_method, write_policy
+from clbench.jobs.recorded import has_record, set_aside
 from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.registry import load_method
 from clbench.records.reader import read_record
@@ -275,3 +277,17 @@ def test_a_bad_name_or_folder_ends_the_command_with_one_line(
 
 def test_the_class_is_named_after_the_module() -> None:
     assert [class_name(name) for name in ("ewc", "my_method", "a__b2")] == ["Ewc", "MyMethod", "AB2"]
+
+
+@pytest.mark.long
+def test_a_record_counts_only_for_the_code_that_its_policy_has_now(fresh_policy: str, tmp_path: Path) -> None:
+    spec, records = RunSpec(TINY.id, "frozen", 0, policy=fresh_policy), tmp_path / "records"
+    module = tmp_path / "fresh_policy.py"
+    made = module.read_text(encoding="utf-8")
+    execute(spec, records)
+    assert has_record(spec.resolve(), records)
+    module.write_text(f"{made}\n_CHANGED = 1\n", encoding="utf-8")
+    assert not has_record(spec.resolve(), records)
+    said = set_aside(spec.resolve(), records)
+    assert said is not None
+    assert f"the code of {fresh_policy} has changed since. It is renamed to seed-0.json.old" in said

@@ -1,12 +1,18 @@
 """The command `clbench tune`; its refusals are among those of test_main.py."""
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
+from torch import Tensor
 
 from clbench.cli.main import app
+from clbench.learning.method import Method, Progress
+from clbench.policy.batch import Batch
+from clbench.policy.policy import Policy
 from clbench.records.reader import read_record
 
 TINY = "tiny:me/Tiny-v0"
@@ -92,3 +98,45 @@ def test_a_fixed_setting_is_in_every_run_and_in_the_file(tune: Tune, tmp_path: P
     assert {one["settings"]["schedule"] for one in (found, *found["tried"])} == {2.0}
     records = (tmp_path / "leaderboard" / "tuning").rglob("seed-103.json")
     assert [json.loads(path.read_text())["run"]["settings"]["schedule"] for path in records] == [2.0] * 6
+
+
+@dataclasses.dataclass
+class Diverging(Method):
+    """A method that fails at the learning rates from `fails_from` on."""
+
+    fails_from: ClassVar[float] = 1.0
+
+    def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
+        return policy.action_loss(batch).mean() / (self.step_factor < self.fails_from)
+
+
+@dataclasses.dataclass
+class Hopeless(Diverging):
+    """A method that fails at every learning rate."""
+
+    fails_from: ClassVar[float] = 0.0
+
+
+@pytest.mark.long
+def test_a_setting_that_fails_is_not_chosen_and_a_method_that_always_fails_stops_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(".")
+    names = [f"{__name__}:{cls.__name__}" for cls in (Diverging, Hopeless)]
+    with pytest.raises(SystemExit, match="1"):
+        app(["tune", TINY, *names, "--first-seed", "103", "--seeds", "1", "--write", "mine.json"])
+    said = capsys.readouterr()
+    assert f"All first four settings failed: {names[1]}." in said.err
+    assert "me--Tiny-v0.json: copy mine.json there, on every machine" in " ".join(said.err.split())
+    methods = json.loads((tmp_path / "mine.json").read_text())["methods"]
+    assert list(methods) == names[:1]
+    tried = methods[names[0]]["tried"]
+    assert (tried[0]["settings"], tried[0]["learned"], tried[0]["final_average"]) == (
+        {"step_factor": 1.0},
+        None,
+        None,
+    )
+    assert methods[names[0]]["settings"]["step_factor"] < 1.0
+    assert len(tried) == 6
+    assert "failed" in said.out

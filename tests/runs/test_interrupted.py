@@ -4,11 +4,13 @@ import dataclasses
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any, ClassVar
 
 import pytest
+from tiny import TINY
 from torch import Tensor
 
-from clbench.learning.method import Method
+from clbench.learning.method import Method, Stage
 from clbench.policy.policy import Policy
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
@@ -45,3 +47,36 @@ def test_ctrl_c_while_policies_are_made_again_is_no_fault_of_the_method(
 ) -> None:
     with pytest.raises(KeyboardInterrupt):
         make_stages(RunSpec(TOY, stranger(_Interrupted), seed=0).resolve())
+
+
+@dataclasses.dataclass
+class _InterruptedOnce(Method):
+    """Ends its first run in the second stage, as a lost machine does."""
+
+    lost: ClassVar[list[bool]] = []
+
+    def start_task(self, policy: Policy, stage: Stage) -> Any:
+        if stage.number == 2 and not self.lost:
+            self.lost.append(True)
+            raise KeyboardInterrupt
+        return policy.parameters()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("instructions", "resumed"), [(None, True), ("NEON", False)])
+def test_a_run_goes_on_only_where_the_processor_computes_like_the_first_one(
+    tmp_path: Path,
+    stranger: Callable[[type[Method]], str],
+    monkeypatch: pytest.MonkeyPatch,
+    instructions: str | None,
+    resumed: bool,
+) -> None:
+    monkeypatch.setattr(_InterruptedOnce, "lost", [])
+    spec = RunSpec(TINY.id, stranger(_InterruptedOnce), seed=0)
+    with pytest.raises(KeyboardInterrupt):
+        execute(spec, tmp_path)
+    if instructions is not None:
+        monkeypatch.setattr("torch.backends.cpu.get_cpu_capability", lambda: instructions)
+    record = execute(spec, tmp_path)
+    assert record.status == "success"
+    assert ("resumed_after" in record.timing) == resumed

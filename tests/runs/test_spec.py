@@ -9,7 +9,7 @@ from tiny import TINY
 
 from clbench.base.errors import ClbenchError, InputError, UnknownNameError
 from clbench.runs.run import execute
-from clbench.runs.spec import RunSpec
+from clbench.runs.spec import RunSpec, check_device
 
 TOY = "clbench.testing:clbench/Toy-v0"
 
@@ -88,3 +88,14 @@ def test_a_wrong_name_or_value_is_refused_before_any_work(
 def test_an_impossible_run_is_refused_where_it_is_built(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(ClbenchError, match=message):
         RunSpec(**{"scenario": TOY, "method": "sft", "seed": 0, **fields})
+
+
+@pytest.mark.parametrize(("device", "touched"), [("cuda", False), ("cuda:1", False), ("cuda:7", True)])
+def test_a_gpu_that_exists_is_left_to_the_workers(
+    monkeypatch: pytest.MonkeyPatch, device: str, touched: bool
+) -> None:
+    seen = []
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
+    monkeypatch.setattr("torch.zeros", lambda *_, device: seen.append(device))
+    check_device(device)
+    assert bool(seen) == touched

@@ -88,3 +88,16 @@ def test_the_command_explains_a_wrong_value_in_one_line(
     with pytest.raises(SystemExit, match="2"):
         resolve("clbench.cli.runs:score")(ID, **given)
     assert message in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_written_is_named_before_the_server_is_looked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "file"
+    file.write_text("precious")
+    options = {"policy": "ws://127.0.0.1:9", "stage": 0, "method": "me/elsewhere", "records": file}
+    with pytest.raises(SystemExit, match="2"):
+        resolve("clbench.cli.runs:score")(ID, **options)
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"--records {file} cannot be written to: Not a directory." in said
+    assert file.read_text() == "precious"

@@ -8,6 +8,7 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgpack
@@ -256,9 +257,10 @@ OBSERVATIONS: dict[str, Any] = {
 class LeRobotShaped:
     """Has the documented interface of LeRobot's policies, with normalisation in the processors."""
 
-    def __init__(self, noise: float = 0.0) -> None:
+    def __init__(self, noise: float = 0.0, executed: int = 5) -> None:
         self.batches: list[dict[str, Any]] = []
         self.noise = noise
+        self.config = SimpleNamespace(n_action_steps=executed)
 
     def preprocess(self, batch: dict[str, Any]) -> dict[str, Any]:
         self.batches.append(batch)
@@ -292,6 +294,19 @@ def test_a_policy_of_lerobot_receives_its_batch_and_its_actions_are_processed_st
     assert torch.equal(
         policy.batches[1]["observation.environment_state"], policy.batches[1]["observation.state"]
     )
+
+
+@pytest.mark.parametrize(("executed", "found"), [(3, 3), (9, 5)])
+def test_of_a_chunk_of_lerobot_as_many_actions_are_executed_as_lerobot_executes(
+    executed: int, found: int
+) -> None:
+    policy = LeRobotShaped(executed=executed)
+    whole = LeRobotShaped()
+    actions, every = (
+        lerobot_policy(one, one.preprocess, one.postprocess)(OBSERVATIONS) for one in (policy, whole)
+    )
+    assert actions.shape == (2, found, 2)
+    assert np.array_equal(actions, every[:, :executed])
 
 
 def test_a_policy_of_lerobot_draws_the_same_noise_for_the_same_request() -> None:

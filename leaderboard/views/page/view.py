@@ -20,7 +20,7 @@ from ...board.tiers import TIERS
 from ...policies.compared import Comparison, Comparisons
 from ...policies.decoders import Decoding, read_decoding
 from ..descriptions import RULES
-from ..format import Column, agreement_text, prediction_text, start_text, tiers_text, title_of
+from ..format import Column, agreement_text, prediction_text, start_text, tiers_text, title_of, unpaired_text
 from .definitions import Family, families
 from .rows import RowView, columns, others, places, row_view
 from .stills import film, stills
@@ -223,7 +223,15 @@ def scenarios(tables: Mapping[str, list[Row]], board: Board, comparisons: Compar
                 tuple(families(competing)) if len(competing) >= FEWEST else (),
                 board.frontiers.get(scenario, ()),
                 board.tied.get(scenario, {}),
-                start_text(board.starts.get(scenario)),
+                " ".join(
+                    filter(
+                        None,
+                        (
+                            start_text(board.starts.get(scenario)),
+                            unpaired_text(board.unpaired.get(scenario)),
+                        ),
+                    )
+                ),
                 agreement_text(board.agreements.get(scenario)),
                 comparisons.get(scenario, ()),
                 decoding if decoding and scenario == decoding.table else None,

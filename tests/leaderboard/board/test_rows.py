@@ -22,6 +22,7 @@ division_of = resolve("clbench.leaderboard.board.runs:division_of")
 no_row = resolve("clbench.leaderboard.board.runs:no_row")
 pretrained_success = resolve("clbench.leaderboard.board.rows:pretrained_success")
 standing_of = resolve("clbench.leaderboard.board.rows:standing_of")
+unpaired = resolve("clbench.leaderboard.board.rows:unpaired")
 values_by_seed = resolve("clbench.leaderboard.board.rows:values_by_seed")
 
 LUCK = (0.1, 0.1, 0.5, 0.5)
@@ -292,3 +293,17 @@ def test_a_policy_trained_elsewhere_cannot_have_checks(add_elsewhere: Callable[.
     table = compute_board(add_elsewhere(0, checks))
     assert table.rows == ()
     assert "a policy that was trained elsewhere is not checked" in table.not_shown[0].reason
+
+
+def test_runs_that_began_with_another_pretrained_policy_than_plain_fine_tuning_are_listed() -> None:
+    def row(method: str, division: str = "prior-data-free", **policies: str) -> Any:
+        runs = [
+            SimpleNamespace(seed=int(seed[1:]), record=SimpleNamespace(fingerprint={"pretrained": policy}))
+            for seed, policy in policies.items()
+        ]
+        return SimpleNamespace(method=method, division=division, runs=runs)
+
+    sft = row("sft", s0="a", s1="b")
+    others = row("mine:Mine", s0="a", s1="c", s2="d"), row("lora", s0="a", s1="b")
+    assert unpaired([sft, *others, row("them", "external", s0="z")]) == {"mine:Mine": [1]}
+    assert unpaired(others) == {}

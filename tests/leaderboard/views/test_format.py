@@ -10,6 +10,7 @@ import pytest
 from clbench.base.entry_points import resolve
 
 agreement_text = resolve("clbench.leaderboard.views.format:agreement_text")
+unpaired_text = resolve("clbench.leaderboard.views.format:unpaired_text")
 Concordance = resolve("clbench.leaderboard.board.agreement:Concordance")
 tier_text = resolve("clbench.leaderboard.views.format:tier_text")
 tiers_text = resolve("clbench.leaderboard.views.format:tiers_text")
@@ -79,3 +80,12 @@ def test_only_an_agreement_beyond_chance_is_called_one() -> None:
         "It is not certain that the 12 seeds agree on the order of the 15 methods: Kendall's W 0.10, p = 0.2."
     )
     assert agreement_text(None) == ""
+
+
+def test_runs_that_did_not_begin_like_plain_fine_tuning_are_named_with_a_way_out() -> None:
+    assert unpaired_text(None) == ""
+    assert unpaired_text({"mine:Mine": [1, 2], "lora": [3]}) == (
+        "These runs began with another pretrained policy than sft's: mine:Mine (seeds 1, 2); lora (seeds 3). "
+        "Their gain compares unlike runs: to mend it, run sft on the same kind of processor, with --records "
+        "in a folder of its own."
+    )

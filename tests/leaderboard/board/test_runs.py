@@ -1,0 +1,38 @@
+"""What runs must share to make a row together."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clbench.base.entry_points import resolve
+from clbench.records.paths import record_path
+from clbench.records.record import Record
+from clbench.records.writer import write_record
+
+ALIKE = resolve("clbench.leaderboard.board.runs:ALIKE")
+read_run = resolve("clbench.leaderboard.board.runs:read_run")
+read_runs = resolve("clbench.leaderboard.board.runs:read_runs")
+
+SCENARIO = "clbench/Toy-v0"
+
+
+@pytest.mark.parametrize(
+    ("part", "names"), [("method", {"method": "family:Mine"}), ("policy", {"policy": "mine:Policy"})]
+)
+def test_seeds_of_code_that_changed_between_them_make_no_row_together(
+    part: str, names: dict[str, Any], make_record: Callable[..., Record], tmp_path: Path
+) -> None:
+    records = tmp_path / "records"
+    for seed, code in enumerate(("old", "new", "new")):
+        record = make_record([[1.0, 0.0], [0.5, 1.0]], groups=(1, 1, 0), episodes=2, seed=seed, method="sft")
+        record.fingerprint[part] = {"source": code} if part == "method" else code
+        run = dataclasses.replace(record.run, **names)
+        path = record_path(records, SCENARIO, run.method, seed, policy=run.policy)
+        write_record(dataclasses.replace(record, run=run), path)
+    kept, refused = read_runs(records, read_run, ALIKE)
+    assert len(kept) == 2
+    (entry,) = refused
+    assert entry.reason == f"its settings do not match most seeds: code of the {part} differ."
