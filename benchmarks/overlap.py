@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from result_files import FOLDER
+from result_files import FOLDER, read_results
 
 import clbench
 from clbench.base.entry_points import resolve
@@ -59,14 +59,13 @@ def main() -> None:
     """Measure the scenarios that are named, all if none is, and write the results and the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("ids", nargs="*", default=SCENARIOS, help="Gymnasium ids of scenarios")
-    path = FOLDER / "overlap.json"
-    results = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    results = read_results("overlap") or {}
     for name in parser.parse_args().ids:
         results[name] = measured(clbench.load_scenario(name))
         print(f"{name}: measured")
     ordered = dict.fromkeys([*SCENARIOS, *results])
     results = {name: results[name] for name in ordered if name in results}
-    path.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    (FOLDER / "overlap.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
     PAGE.write_text(page(results), encoding="utf-8")
 
 

@@ -74,14 +74,14 @@ def main() -> None:
         print(f"first text of the published page: {ours:.0f} ms, of an empty page: {empty:.0f} ms")
 
 
-def first_text(chromium: str, address: str, times: int = 5) -> float:
-    """Return the milliseconds until a browser shows the first text of a page, the median of several times."""
+def first_text(chromium: str, address: str) -> float:
+    """Return the milliseconds until a browser shows the first text of a page, the median of five times."""
     from playwright.sync_api import sync_playwright  # only here: a browser is not needed otherwise
 
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         found: list[float] = []
-        for _ in range(times):
+        for _ in range(5):
             page = browser.new_page()
             page.goto(address)
             page.wait_for_function(f"{PAINT}.length")

@@ -267,12 +267,15 @@ class Contender(Protocol):
         ...
 
 
-class Gymnasium:
-    """A vector environment of Gymnasium."""
+class Vector:
+    """A vector environment that has been reset, of Gymnasium or of Stable-Baselines3.
 
-    def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> None:
+    Args:
+        env: The environment; both have `step` and `close`.
+    """
+
+    def __init__(self, env: Any) -> None:
         self.env = env
-        self.env.reset(seed=0)
 
     def run(self, actions: Actions) -> None:
         """Step each environment by its actions (steps, num_envs, A)."""
@@ -280,28 +283,23 @@ class Gymnasium:
             self.env.step(batch)
 
     def close(self) -> None:
-        """Close it."""
+        """Close it, with its processes."""
         self.env.close()
 
 
-class Subproc:
-    """The vector environment of Stable-Baselines3: a process for each environment."""
+def _of_gymnasium(env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> Vector:
+    env.reset(seed=0)
+    return Vector(env)
 
-    def __init__(self, make: Callable[[], Env], num_envs: int) -> None:
-        from stable_baselines3.common.vec_env import SubprocVecEnv
 
-        self.env = SubprocVecEnv([make] * num_envs)
-        self.env.seed(0)
-        self.env.reset()
+def _subproc(make: Callable[[], Env], num_envs: int) -> Vector:
+    """Return the vector environment of Stable-Baselines3: a process for each environment."""
+    from stable_baselines3.common.vec_env import SubprocVecEnv
 
-    def run(self, actions: Actions) -> None:
-        """Step each environment by its actions (steps, num_envs, A)."""
-        for batch in actions:
-            self.env.step(batch)
-
-    def close(self) -> None:
-        """End its processes."""
-        self.env.close()
+    env = SubprocVecEnv([make] * num_envs)
+    env.seed(0)
+    env.reset()
+    return Vector(env)
 
 
 class Raw:
@@ -353,15 +351,15 @@ def contenders(suite: Suite, num_envs: int, threads: int) -> dict[str, Contender
     peer.reset(seed=0)
     physics = suite.physics(peer)
 
-    def ours(**how: Any) -> Gymnasium:
-        return Gymnasium(gymnasium.make_vec(suite.ours, num_envs=num_envs, **options, **how))
+    def ours(**how: Any) -> Vector:
+        return _of_gymnasium(gymnasium.make_vec(suite.ours, num_envs=num_envs, **options, **how))
 
     # processes first: they are forks of this one, which has no threads yet
     others: dict[str, Contender] = {
-        "AsyncVectorEnv": Gymnasium(gymnasium.vector.AsyncVectorEnv([suite.peer] * num_envs))
+        "AsyncVectorEnv": _of_gymnasium(gymnasium.vector.AsyncVectorEnv([suite.peer] * num_envs))
     }
     if suite.has_subproc:
-        others["SubprocVecEnv"] = Subproc(suite.peer, num_envs)
+        others["SubprocVecEnv"] = _subproc(suite.peer, num_envs)
     return {
         "clbench": ours(threads=threads),
         "clbench, one thread": ours(threads=1),

@@ -95,16 +95,14 @@ def show(
     if board is None:
         board = computed = _computed(records)
     if not board.rows:
-        for entry in board.not_shown:
-            messages.print(Text(printable(f"Not shown: {entry.path}: {entry.reason}")))
+        _print_not_shown(board, messages)
         messages.print(error_line(f"No record in {records} makes a row, and no board was written."))
         raise SystemExit(2)
     with checked_input():
         shown = _chosen(board, scenario, records)
     if as_json:
         print_json([dict(zip(column_names(), values_of(row), strict=True)) for row in shown.rows])
-        for entry in shown.not_shown:
-            messages.print(Text(printable(f"Not shown: {entry.path}: {entry.reason}")))
+        _print_not_shown(shown, messages)
         return
     with checked_input():
         written = [] if computed is None else write_site(computed, records, inputs)
@@ -114,6 +112,11 @@ def show(
         print_written(written)
     else:
         console.print(Text(f"Unchanged: {site_of(records)}"), soft_wrap=True)
+
+
+def _print_not_shown(board: Summary, console: Console) -> None:
+    for entry in board.not_shown:
+        console.print(Text(printable(f"Not shown: {entry}")))
 
 
 def _computed(records: Path) -> Board:

@@ -72,6 +72,6 @@ def compare(
     board = compute_board(Path(records), places)
     absent = set(names) - {row.method for row in board.rows}
     if absent:
-        reasons = " ".join(f"{one.path}: {one.reason}" for one in board.not_shown)
+        reasons = " ".join(map(str, board.not_shown))
         raise InputError(f"No row for {', '.join(sorted(absent))}. {reasons}")
     return frame_of(board)

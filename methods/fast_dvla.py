@@ -29,8 +29,8 @@ Details:
 7. The regulariser's gradient is clipped together with the loss's, to a norm of 1, and goes through Adam.
 8. The vector is cached. The steps that made it count in every row.
 9. Where nothing is retained, there is no skill to make a vector from: the run fails and says so.
-10. The auxiliary objective has the factor that pretraining gives questions, 1 (Spatial Forcing: 0.5), and alpha
-   is the published 1.1; neither was tuned here.
+10. The auxiliary objective has the factor that pretraining gives questions, 1 (Spatial Forcing: 0.5), and
+   alpha is the published 1.1; neither was tuned here.
 
 `direction="random"` is the control: a random vector with the capability vector's norm in each matrix.
 """

@@ -12,7 +12,8 @@ from typing import Any
 
 import clbench
 import clbench.testing
-from clbench.cli.main import COMMANDS, DEMONSTRATIONS, EXPERTS
+from clbench.cli.data import DEMONSTRATIONS
+from clbench.cli.main import COMMANDS, EXPERTS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -37,8 +37,11 @@ if TYPE_CHECKING:
 # PyTorch and the simulators are imported where they are needed: `--help` does not wait for them.
 
 
-_COMMANDS = ("export", "import")
-"""Commands of `clbench demonstrations`; a test compares them with those of `clbench.cli.main`."""
+DEMONSTRATIONS = {
+    "export": "clbench.cli.data:export",
+    "import": "clbench.cli.data:import_",
+}
+"""Entry points of the commands of `clbench demonstrations`, which itself collects and lists them."""
 
 
 def _no_command(_: object, name: str) -> None:
@@ -46,7 +49,7 @@ def _no_command(_: object, name: str) -> None:
     from clbench.spec.identifiers import scenario_ids
 
     if not {"/", ":"} & set(name):
-        raise CycloptsError(msg=str(unknown("command or scenario", name, [*_COMMANDS, *scenario_ids()])))
+        raise CycloptsError(msg=str(unknown("command or scenario", name, [*DEMONSTRATIONS, *scenario_ids()])))
 
 
 def demonstrations(

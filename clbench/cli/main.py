@@ -14,6 +14,7 @@ from rich.logging import RichHandler
 import clbench
 from clbench.base.text import printable_lines
 from clbench.cli.arguments import parsing_error, read_paths
+from clbench.cli.data import DEMONSTRATIONS
 from clbench.cli.data import demonstrations as collect
 
 if TYPE_CHECKING:
@@ -66,12 +67,6 @@ NAMES = {
     "measure": "SCENARIO [TASKS...]",
 }
 """Arguments in the first line of a command's help, where Cyclopts would show [ARGS...]."""
-
-DEMONSTRATIONS = {
-    "export": "clbench.cli.data:export",
-    "import": "clbench.cli.data:import_",
-}
-"""Entry points of the commands of `clbench demonstrations`, which itself collects and lists them."""
 
 EXPERTS = {
     "measure": "clbench.cli.data:measure",

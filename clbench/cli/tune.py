@@ -136,7 +136,7 @@ def tune(
             print_plain(Console(stderr=True), f"`clbench run` reads {read}: {copy}")
     if len(chosen) < len(names):
         without = ", ".join(name for name in names if name not in chosen)
-        print_plain(Console(stderr=True), f"All first four settings failed: {without}.", "bold red")
+        print_plain(Console(stderr=True), f"Failed at every learning rate: {without}.", "bold red")
         sys.exit(1)
 
 

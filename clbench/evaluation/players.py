@@ -261,12 +261,8 @@ def _observations(lanes: Lanes, live: Sequence[Live]) -> Iterator[Observation]:
 def _act(agent: Agent, lanes: Lanes, live: Sequence[Live]) -> NDArray[np.float32]:
     """Return the actions (1, A) of an agent in the only lane, and let it keep its memory."""
     (one,), (observation,) = live, _observations(lanes, live)
-    predict = getattr(agent, "predict", None)
-    if predict is None:
-        action = agent(observation)  # type: ignore[operator]
-    else:
-        reminder = {} if one.memory is None else {"state": one.memory}
-        action, one.memory = _predicted(predict(observation, deterministic=True, **reminder))
+    reminder = {} if one.memory is None else {"state": one.memory}
+    action, one.memory = _predicted(agent, observation, **reminder)
     return _checked(action, lanes, live, ())
 
 
@@ -275,11 +271,7 @@ def _act_on_batch(agent: Agent, lanes: Lanes, live: Sequence[Live]) -> NDArray[n
     rows = list(_observations(lanes, live))
     rows += [rows[0]] * (LANES - len(rows))
     batch = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-    predict = getattr(agent, "predict", None)
-    if predict is None:
-        actions, memory = agent(batch), None  # type: ignore[operator]
-    else:
-        actions, memory = _predicted(predict(batch, deterministic=True))
+    actions, memory = _predicted(agent, batch)
     if memory is not None:
         raise InputError("The agent has a memory, and cannot act on batches: pass batched=False.")
     return _checked(actions, lanes, live, (LANES,))[: len(live)]
@@ -340,7 +332,12 @@ class _ChunkPlayer:
         return float(not_finite), float(clipped)
 
 
-def _predicted(found: Any) -> tuple[Any, Any]:
+def _predicted(agent: Agent, observation: Any, **reminder: Any) -> tuple[Any, Any]:
+    """Return the action of an agent, or its actions, and its memory; a function has none."""
+    predict = getattr(agent, "predict", None)
+    if predict is None:
+        return agent(observation), None  # type: ignore[operator]
+    found = predict(observation, deterministic=True, **reminder)
     if not (isinstance(found, tuple) and len(found) == 2):
         raise InputError("predict() must return (action, state), as in Stable-Baselines3.")
     return found

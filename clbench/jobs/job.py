@@ -92,14 +92,17 @@ def chain_times(jobs: Iterable[Job]) -> dict[Job, float]:
     return {job: time_of_chain(job) for job in jobs}
 
 
+Outcome = Literal["done", "failed", "taken"]
+"""How a job ended by its own words; a job is taken if another process took its work over."""
+
+
 class Event(NamedTuple):
     """A message from a worker."""
 
     job: Job
     """Job that it is about."""
-    kind: Literal["progress", "at", "done", "failed", "lost", "taken"]
-    """All kinds but the first two end the job. A job is lost if its process ended without a result, and taken
-    if another process took its work over."""
+    kind: Literal["progress", "at", "lost"] | Outcome
+    """All kinds but the first two end the job. A job is lost if its process ended without a result."""
     value: Any
     """Length done since the last event, the place that the job has reached, the text that it returned, or the
     reason of the failure."""

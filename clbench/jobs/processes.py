@@ -17,13 +17,13 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from types import ModuleType
-from typing import Any, Literal
+from typing import Any
 
 from clbench.base.errors import ClbenchError
 from clbench.base.lease import LeaseLostError
 from clbench.base.progress import ProgressCallback, listen
 from clbench.jobs.folders import absolute_places
-from clbench.jobs.job import Event, Job
+from clbench.jobs.job import Event, Job, Outcome
 from clbench.jobs.process_limits import end, end_group, exceeded, signal_group
 from clbench.worlds.threads import cores
 
@@ -327,7 +327,7 @@ def _work(
 
 def _do_job(
     function: Callable[..., str], arguments: dict[str, Any], send: ProgressCallback
-) -> tuple[Literal["done", "failed", "taken"], str]:
+) -> tuple[Outcome, str]:
     """Do one job in this process, and return how it ended and its result.
 
     Args:

@@ -13,13 +13,13 @@ from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 from clbench.base.cache import cache_folder, hash_of
 from clbench.base.dependencies import require
 from clbench.base.errors import ClbenchError, InputError, UnknownNameError
 from clbench.jobs.folders import absolute_places
-from clbench.jobs.job import Event, Job
+from clbench.jobs.job import Event, Job, Outcome
 from clbench.jobs.processes import Processes
 from clbench.records.reader import read_record
 from clbench.records.record import Record
@@ -35,8 +35,6 @@ _INSTRUCTIONS = (
     "NPY_DISABLE_CPU_FEATURES",
 )
 """Variables that select the instructions of the processor, and so affect the bits of trained weights."""
-Outcome = Literal["done", "failed", "taken"]
-"""How a job ended."""
 _PASSED_ON = ("MUJOCO_GL", *_INSTRUCTIONS)
 _PATIENCE = 10.0
 """Seconds in which the machine of a cluster must accept a connection."""

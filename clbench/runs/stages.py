@@ -72,30 +72,6 @@ def machine_needed() -> Iterator[None]:
         ) from error
 
 
-def stage_policies(
-    run: ResolvedRun, checkpoints: Path | None = None, progress: ProgressCallback = no_progress
-) -> list[Policy]:
-    """Return the policy after every stage of a run, from stage 0.
-
-    Policies that the run kept are read; otherwise they are made again and stay in the cache.
-
-    Args:
-        run: The run. Its evaluation episodes make no difference.
-        checkpoints: Folder below which policies were kept, as for `execute`.
-        progress: Called with the number of optimiser steps done since its last call; an existing stage counts
-            in full.
-
-    Raises:
-        MethodError: The method fails; the message names the place.
-    """
-    folder = find_stages(run, checkpoints)
-    if folder is None:
-        return load_stages(run, make_stages(run, progress))
-    scenario = run.scenario
-    progress(len(scenario.target) * scenario.budget.adaptation_steps)
-    return load_stages(run, folder)
-
-
 def find_stages(run: ResolvedRun, checkpoints: Path | None = None) -> Path | None:
     """Return the folder with the policies of all stages of a run, "stage-0" and so on, or None.
 
@@ -129,8 +105,9 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
     """Make the policies of all stages without evaluation, and return their folder in the cache.
 
     Args:
-        run: The run.
-        progress: As for `stage_policies`.
+        run: The run. Its evaluation episodes make no difference.
+        progress: Called with the number of optimiser steps done since its last call; a stage in the cache
+            counts in full.
 
     Raises:
         MethodError: The method fails; the message names the place.
@@ -193,7 +170,7 @@ def keep_stages(run: ResolvedRun, checkpoints: Path, progress: ProgressCallback 
     Args:
         run: The run.
         checkpoints: Folder below which the policies are kept.
-        progress: As for `stage_policies`.
+        progress: As for `make_stages`.
     """
     folder = make_stages(run, progress)
     drop_stages(run, checkpoints)

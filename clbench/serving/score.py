@@ -120,20 +120,8 @@ def score(
     begin = time.perf_counter()
     record = run.begin(stage, None if executed is None else {"executed": executed}, policy, restart)
     server = _kept_metadata(getattr(policy, "metadata", {}))
-    if server and server == record.diagnostics.get(str(stage - 1), {}).get("server"):
-        LOG.warning(
-            "The server sends the same metadata as in stage %d (%s): does it serve the new checkpoint?",
-            stage - 1,
-            described(server),
-        )
-    same = _seeds_of(server, run, stage) if server and stage else []
-    if same:
-        LOG.warning(
-            "The server sends the same metadata as with seed %s in this stage (%s): fine-tune once for "
-            "each seed. Seeds of one checkpoint differ only in their initial states.",
-            ", ".join(map(str, same)),
-            described(server),
-        )
+    if server:
+        _warn_if_known(server, record, run, stage)
     trials = run.trials(stage)
     with seeded("external evaluation", seed, stage):
         played = play_chunks(
@@ -158,6 +146,24 @@ def score(
     run.time(record, None, time.perf_counter() - begin)
     run.keep(record, stage)
     return record
+
+
+def _warn_if_known(server: Mapping[str, Any], record: Record, run: StagedRun, stage: int) -> None:
+    """Say if a server says the same about itself as in the stage before, or as with another seed."""
+    if server == record.diagnostics.get(str(stage - 1), {}).get("server"):
+        LOG.warning(
+            "The server sends the same metadata as in stage %d (%s): does it serve the new checkpoint?",
+            stage - 1,
+            described(server),
+        )
+    same = _seeds_of(server, run, stage) if stage else []
+    if same:
+        LOG.warning(
+            "The server sends the same metadata as with seed %s in this stage (%s): fine-tune once for "
+            "each seed. Seeds of one checkpoint differ only in their initial states.",
+            ", ".join(map(str, same)),
+            described(server),
+        )
 
 
 def _warn_if_unchanged(record: Record, stage: int) -> None:

@@ -19,8 +19,8 @@ from clbench.scoring.intervals import Estimate, Runs, estimate, row_generator
 from clbench.spec.references import BASELINE
 
 from .paths import LADDER, beside
-from .runs import ALIKE, Run, Sifted, is_number, no_row, read_run, read_runs
-from .summary import DIVISIONS, GAIN
+from .runs import ALIKE, Run, Sifted, is_number, read_run, read_runs, sift_by
+from .summary import DIVISIONS, GAIN, grouped
 
 FACTOR = "step_factor"
 """Hyper-parameter that the ladder changes."""
@@ -91,10 +91,8 @@ def _is_ladder(runs: Sequence[Run]) -> bool:
 
 def on_the_ladder(runs: list[Run]) -> Sifted:
     """Keep the runs that changed the learning rate."""
-    changed = [is_number(run.record.run.changes.get(FACTOR)) for run in runs]
-    kept = [run for run, is_kept in zip(runs, changed, strict=True) if is_kept]
-    others = [run for run, is_kept in zip(runs, changed, strict=True) if not is_kept]
-    return kept, [no_row(run.path, f"its changes have no {FACTOR}, the ladder's setting.") for run in others]
+    fault = f"its changes have no {FACTOR}, the ladder's setting."
+    return sift_by(runs, lambda run: "" if is_number(run.record.run.changes.get(FACTOR)) else fault)
 
 
 def _curves(runs: Sequence[Run]) -> tuple[Curve, ...]:
@@ -123,9 +121,7 @@ def apart_from_the_factor(run: Run) -> str:
 
 
 def _rungs(runs: Sequence[Run]) -> tuple[Rung, ...]:
-    by_factor: dict[float, list[Run]] = {}
-    for run in runs:
-        by_factor.setdefault(float(run.record.run.changes[FACTOR]), []).append(run)
+    by_factor = grouped((float(run.record.run.changes[FACTOR]), run) for run in runs)
     return tuple(_rung(factor, members) for factor, members in sorted(by_factor.items(), reverse=True))
 
 

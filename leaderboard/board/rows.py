@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import chain, groupby
 from pathlib import Path
@@ -27,7 +27,7 @@ from .agreement import Concordance, concordance
 from .costs import costs_of
 from .frontier import Curve, TiedGain, frontiers_of, ladder_of, read_ladder, tied_gains
 from .orders import Orders, orders_of
-from .runs import ALIKE, Run, Sifted, no_row, read_run, read_runs
+from .runs import ALIKE, Run, Sifted, read_run, read_runs, sift_by
 from .summary import (
     DIVISIONS,
     ELSEWHERE,
@@ -37,6 +37,7 @@ from .summary import (
     WITHOUT_DEMONSTRATIONS,
     RowSummary,
     Summary,
+    grouped,
 )
 from .tiers import TIERS
 
@@ -111,18 +112,14 @@ def _rivals(rows: Iterable[Row]) -> dict[str, Runs]:
 def _beside_rows(runs: list[Run]) -> Sifted:
     """Keep the runs of methods that have a row: one with the targets in the published order."""
     with_row = {(run.table, run.method) for run in runs if not run.order}
-    kept = [run for run in runs if (run.table, run.method) in with_row]
-    alone = [run for run in runs if (run.table, run.method) not in with_row]
-    reason = "its method has no run with the targets in the published order, which a row needs."
-    return kept, [no_row(run.path, reason) for run in alone]
+    alone = "its method has no run with the targets in the published order, which a row needs."
+    return sift_by(runs, lambda run: "" if (run.table, run.method) in with_row else alone)
 
 
 def _scenario_rows(runs: list[Run]) -> list[Row]:
     """Return the rows of the runs of one scenario, by division, the best first: see `_heights`."""
-    by_method: dict[str, list[Run]] = {}
-    for run in sorted(runs, key=lambda run: run.seed):
-        if not run.order:
-            by_method.setdefault(run.method, []).append(run)
+    by_seed = sorted((run for run in runs if not run.order), key=lambda run: run.seed)
+    by_method = grouped((run.method, run) for run in by_seed)
     rows = []
     for division in DIVISIONS:
         members = {method: runs for method, runs in by_method.items() if runs[0].division == division}
@@ -133,15 +130,7 @@ def _scenario_rows(runs: list[Run]) -> list[Row]:
         heights = _heights(finals, scores, _scores(by_method.get(BASELINE, ())))
         order = sorted(members, key=lambda method: (_falling(heights[method]), method))
         rows += [
-            _row(
-                method,
-                estimates[method],
-                letters.get(method),
-                heights[method],
-                members[method],
-                by_method,
-                runs,
-            )
+            _row(method, estimates[method], letters.get(method), heights[method], by_method, runs)
             for method in order
         ]
     return rows
@@ -152,11 +141,11 @@ def _row(
     estimates: Mapping[str, Estimate],
     letters: str | None,
     height: float | None,
-    members: Sequence[Run],
     by_method: Mapping[str, list[Run]],
     runs: Iterable[Run],
 ) -> Row:
-    """Return the row of the runs `members` of a method; `runs` are all of the scenario, in any order."""
+    """Return the row of a method; `runs` are all of the scenario, in any order."""
+    members = by_method[method]
     first = members[0]
     orders = orders_of(run for run in runs if run.method == method)
     return Row(

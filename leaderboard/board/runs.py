@@ -239,6 +239,18 @@ def no_row(path: str, reason: str) -> NotShown:
     return NotShown(printable(path), reason)
 
 
+def sift_by(runs: Iterable[Run], fault: Callable[[Run], str]) -> Sifted:
+    """Keep the runs without a fault.
+
+    Args:
+        runs: The runs.
+        fault: Returns why a run may not be compared, in a sentence; empty if it may.
+    """
+    faults = {run: fault(run) for run in runs}
+    kept = [run for run, found in faults.items() if not found]
+    return kept, [no_row(run.path, found) for run, found in faults.items() if found]
+
+
 def same_scenario(runs: list[Run]) -> Sifted:
     """Keep the runs whose scenario is the usual one, targets compared in their published order."""
 
@@ -272,16 +284,15 @@ def same_definition(runs: list[Run]) -> Sifted:
     """
     kept, refused = _same_parts([run for run in runs if run.record.run.scenario not in pinned()], later=False)
     kept, others = _same_parts(kept, later=True)
-    refused += others
-    for run in runs:
-        scenario = run.record.run.scenario
-        if scenario in pinned():
-            if other := other_parts(_definition(run), pinned()[scenario]):
-                words = f"it was made with another {scenario}: {', '.join(other)} differ."
-                refused.append(no_row(run.path, words))
-            else:
-                kept.append(run)
-    return kept, refused
+    here, changed = sift_by((run for run in runs if run.record.run.scenario in pinned()), _unlike_the_pin)
+    return [*kept, *here], [*refused, *others, *changed]
+
+
+def _unlike_the_pin(run: Run) -> str:
+    """Return in which parts the definition of a run is not the pinned one, in a sentence."""
+    scenario = run.record.run.scenario
+    other = other_parts(_definition(run), pinned()[scenario])
+    return f"it was made with another {scenario}: {', '.join(other)} differ." if other else ""
 
 
 def _same_parts(runs: list[Run], later: bool) -> Sifted:
@@ -373,10 +384,13 @@ def _most(
     members: dict[Hashable, dict[Hashable, list[Run]]] = {}
     for run in runs:
         members.setdefault(group(run), {}).setdefault(trait(run), []).append(run)
-    usual = {key: max(traits.values(), key=_weight)[0] for key, traits in members.items()}
-    kept = [run for run in runs if trait(run) == trait(usual[group(run)])]
-    others = [run for run in runs if trait(run) != trait(usual[group(run)])]
-    return kept, [no_row(run.path, reason(run, usual[group(run)])) for run in others]
+    usual = {key: max(traits.values(), key=_weight) for key, traits in members.items()}
+
+    def fault(run: Run) -> str:
+        alike = usual[group(run)]
+        return "" if run in alike else reason(run, alike[0])
+
+    return sift_by(runs, fault)
 
 
 def _weight(runs: list[Run]) -> tuple[int, int]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol, TypeVar
 
@@ -83,6 +83,9 @@ class NotShown:
     reason: str
     """Reason, in words."""
 
+    def __str__(self) -> str:
+        return f"{self.path}: {self.reason}"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Summary:
@@ -158,7 +161,8 @@ class Placed(Protocol):
 
 OneRow = TypeVar("OneRow", bound=RowSummary)
 PlacedRow = TypeVar("PlacedRow", bound=Placed)
-AnyRow = TypeVar("AnyRow")
+Key = TypeVar("Key")
+Value = TypeVar("Value")
 
 
 def letters_of(row: RowSummary, rows: Iterable[RowSummary]) -> str:
@@ -174,18 +178,19 @@ def letters_of(row: RowSummary, rows: Iterable[RowSummary]) -> str:
 
 def tables_of(rows: Iterable[OneRow]) -> dict[str, list[OneRow]]:
     """Return the rows by the name of their table, tables and rows in the order of `rows`."""
-    return _grouped(rows, lambda row: row.scenario)
+    return grouped((row.scenario, row) for row in rows)
 
 
 def divisions_of(rows: Iterable[PlacedRow]) -> dict[str, list[PlacedRow]]:
     """Return the rows by their division, divisions and rows in the order of `rows`."""
-    return _grouped(rows, lambda row: row.division)
+    return grouped((row.division, row) for row in rows)
 
 
-def _grouped(rows: Iterable[AnyRow], key: Callable[[AnyRow], str]) -> dict[str, list[AnyRow]]:
-    found: dict[str, list[AnyRow]] = {}
-    for row in rows:
-        found.setdefault(key(row), []).append(row)
+def grouped(pairs: Iterable[tuple[Key, Value]]) -> dict[Key, list[Value]]:
+    """Return the values of each key, in their order."""
+    found: dict[Key, list[Value]] = {}
+    for key, value in pairs:
+        found.setdefault(key, []).append(value)
     return found
 
 

@@ -205,8 +205,8 @@ def keeps_answers(evidence: Evidence) -> Finding:
         (aegis,),
         (sft, *gains, *answer_curve(evidence, "aegis")),
         (
-            "Length and learning rate of this scenario were chosen so that sft loses answers (A1), and aegis was "
-            "not tuned here: it may keep answers at smaller rates.",
+            "Length and learning rate of this scenario were chosen so that sft loses answers (A1), and aegis "
+            "was not tuned here: it may keep answers at smaller rates.",
             *_when_lost(evidence, "aegis"),
             not_told_apart(
                 gains[0],

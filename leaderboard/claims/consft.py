@@ -219,7 +219,7 @@ def _reaches(counting: Iterable[Sequence[Figure]], every: Iterable[Sequence[Figu
 
 def _share_of_replay(evidence: Evidence) -> str:
     """Return which share of a batch experience replay draws from prior demonstrations, in words."""
-    run = next(iter(evidence.runs.get("experience_replay", {}).values()), None)
+    run = evidence.first_run("experience_replay")
     share: Any = run.record.run.settings.get("replay") if run else None
     if not is_number(share):
         return ""

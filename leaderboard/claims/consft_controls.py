@@ -33,7 +33,7 @@ def controls_of(evidence: Evidence, arm: str) -> tuple[Figure, ...]:
 
 def sft_at_the_rate_of(evidence: Evidence, arm: str) -> tuple[str, ...]:
     """Return the label of sft at the arm's learning rate, if tuning chose another for sft and it ran."""
-    runs = [next(iter(evidence.runs.get(label, {}).values()), None) for label in (arm, "sft")]
+    runs = [evidence.first_run(label) for label in (arm, "sft")]
     factors = [run.record.run.settings.get("step_factor", PUBLISHED) for run in runs if run is not None]
     if len(factors) < len(runs) or factors[0] == factors[1]:
         return ()

@@ -33,12 +33,11 @@ from ..board.runs import (
     ALIKE,
     Run,
     Sift,
-    Sifted,
     differences,
     is_number,
-    no_row,
     read_run,
     read_runs,
+    sift_by,
 )
 from ..board.summary import NotShown
 
@@ -108,6 +107,10 @@ class Evidence:
         """When the first of the runs started; None if no record says so."""
         starts = [_start_of(run) for runs in self.runs.values() for run in runs.values()]
         return min((start for start in starts if start), default=None)
+
+    def first_run(self, method: str) -> Run | None:
+        """Return the run of a method with the lowest seed, None without one."""
+        return next(iter(self.runs.get(method, {}).values()), None)
 
     # ---- figures of scores -------------------------------------------------------------------------
 
@@ -329,16 +332,8 @@ def _like(scored: Sequence[Run]) -> Sift:
             "rollouts": run.record.fingerprint.get("rollouts"),
         }
 
-    def sift(runs: list[Run]) -> Sifted:
-        kept, refused = [], []
-        for run in runs:
-            example = examples.get(run.table, run)
-            fields = differences(traits(run), traits(example))
-            if fields:
-                reason = f"it cannot be compared with the board: {', '.join(fields)} differ."
-                refused.append(no_row(run.path, reason))
-            else:
-                kept.append(run)
-        return kept, refused
+    def fault(run: Run) -> str:
+        fields = differences(traits(run), traits(examples.get(run.table, run)))
+        return f"it cannot be compared with the board: {', '.join(fields)} differ." if fields else ""
 
-    return sift
+    return lambda runs: sift_by(runs, fault)

@@ -52,7 +52,7 @@ def _settings(evidence: Evidence, *methods: str) -> str:
     """Return the settings of methods that readers must know, for the note of a figure."""
     told = []
     for label in methods:
-        run = next(iter(evidence.runs.get(label, {}).values()), None)
+        run = evidence.first_run(label)
         values = run.record.run.settings if run else {}
         named = [f"{name} {values[name]:g}" for name in TOLD if is_number(values.get(name))]
         told += [f"{label}: {', '.join(named)}"] if named else []
@@ -91,8 +91,8 @@ def loses_no_answers(drop: Figure) -> bool:
 
 def answer_curve(evidence: Evidence, method: str) -> list[Figure]:
     """Return the drop in question accuracy after each evaluated step of the first target."""
-    runs = evidence.runs.get(method, {})
-    steps = next(iter(runs.values())).scores.layout.steps if runs else ()
+    first = evidence.first_run(method)
+    steps = first.scores.layout.steps if first else ()
 
     def drop(point: int) -> Callable[[Of], Array]:
         def at(of: Of) -> Array:

@@ -6,11 +6,9 @@ the last section says what the records cannot tell.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from pathlib import Path
-from typing import TypeVar
 
 from clbench.base.text import counted, listed, megabytes
 from clbench.records.paths import table_parts
@@ -20,22 +18,19 @@ from clbench.spec.references import BASELINE, FROZEN
 
 from ..board.predictors import predictions
 from ..board.rows import Board, Row
-from ..board.summary import WITHOUT_DEMONSTRATIONS, tables_of
+from ..board.summary import WITHOUT_DEMONSTRATIONS, grouped, tables_of
 from ..claims.claim import KNOWLEDGE, PREDICATES, Claim, Verdict, tally
 from ..claims.evidence import Evidence
 from ..claims.judges import Judged
 from ..policies.compared import by_table
 from ..views.format import MISSING, format_interval, tau_text
-from ..views.markdown import templates
+from ..views.markdown import template
 from ..views.page.charts.picture import in_both_themes
 from .agreements import after_correction, agreement_sentences, without_demonstrations
 from .findings_chart import gains_chart
 from .gains import Tied, competing, gain_sentences, gain_table
 from .learning_rates import rate_lines, rate_sentences
 from .lost_skills import relearning_sentences
-
-Key = TypeVar("Key")
-Value = TypeVar("Value")
 
 FORGOTTEN_BY = "kept_share"
 """Metric by which policies are compared: the final average also counts what they knew and learned."""
@@ -59,8 +54,7 @@ class Section:
 
 def page(found: Sequence[Section]) -> str:
     """Return the page as Markdown."""
-    template = templates(Path(__file__).with_name("templates")).get_template("findings.md.jinja")
-    return template.render(sections=found)
+    return template(__file__, "findings.md.jinja").render(sections=found)
 
 
 def pictures(board: Board) -> dict[str, str]:
@@ -186,7 +180,7 @@ def _claims(judged: Sequence[Judged]) -> Section:
             f"{paper}: {tally(one.finding.verdict for one in every)}.{_those_that_hold(every)}{_ours(every)}"
         )
     boards = tuple(dict.fromkeys(one.evidence.scenario for one in judged))
-    found = _grouped((one.claim, one) for one in judged)
+    found = grouped((one.claim, one) for one in judged)
     lines = tuple(_claim_line(claim, members, boards) for claim, members in found.items())
     head = ("id", "claim", "first figure", *boards)
     answers += [*_explanations(judged), *_what_would_show_it(judged)]
@@ -216,7 +210,7 @@ def _verdict_cell(one: Judged, what: str) -> str:
 
 def _explanations(judged: Sequence[Judged]) -> list[str]:
     """Return the last conclusion from the figures and controls of each verdict that is a yes or a no."""
-    told = _grouped(
+    told = grouped(
         ((one.claim.id, sentence), one.evidence.scenario)
         for one in judged
         if one.finding.verdict in ("holds", "holds in part", "does not hold")
@@ -227,25 +221,17 @@ def _explanations(judged: Sequence[Judged]) -> list[str]:
 
 def _what_would_show_it(judged: Sequence[Judged]) -> list[str]:
     """Return a sentence for each thing that boards lack to show some claims."""
-    claims = _grouped(
+    claims = grouped(
         ((one.finding.change, one.evidence.scenario), one.claim.id)
         for one in judged
         if one.finding.verdict == "cannot be shown here"
     )
-    boards = _grouped(((change, listed(names)), board) for (change, board), names in claims.items())
-    places = _grouped((change, f"{names} on {listed(on)}") for (change, names), on in boards.items())
+    boards = grouped(((change, listed(names)), board) for (change, board), names in claims.items())
+    places = grouped((change, f"{names} on {listed(on)}") for (change, names), on in boards.items())
     return [
         f"What would show {'; '.join(where)}: {change[:1].lower()}{change[1:]}"
         for change, where in places.items()
     ]
-
-
-def _grouped(pairs: Iterable[tuple[Key, Value]]) -> dict[Key, list[Value]]:
-    """Return the values of each key, in their order."""
-    found: dict[Key, list[Value]] = {}
-    for key, value in pairs:
-        found.setdefault(key, []).append(value)
-    return found
 
 
 MADE_FOR_IT = "the one scenario that was made to show it, by training far past learning and in large steps"
@@ -253,7 +239,7 @@ MADE_FOR_IT = "the one scenario that was made to show it, by training far past l
 
 def _those_that_hold(judged: Sequence[Judged]) -> str:
     """Return in a sentence which claims hold: some are about plain fine-tuning, costs, or algebra."""
-    boards = _grouped((one.claim, one.finding.verdict in ("holds", "holds in part")) for one in judged)
+    boards = grouped((one.claim, one.finding.verdict in ("holds", "holds in part")) for one in judged)
     words = [
         f"{claim.id}, {claim.words.rstrip('.')} (on "
         + (MADE_FOR_IT if claim.scenarios == KNOWLEDGE else f"{sum(held)} of {counted(len(held), 'board')}")

@@ -9,8 +9,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Template
-
 from clbench.learning.registry import load_method
 from clbench.runs.tuning import CONTROLS, fixed_settings, tuned, tuned_scenarios
 from clbench.scoring.intervals import UNBOUNDED, Estimate
@@ -25,7 +23,7 @@ from ..claims.evidence import SHARE, Evidence
 from ..claims.judges import Judged
 from ..views.descriptions import Description, common_hyper_parameters
 from ..views.format import shown
-from ..views.markdown import arxiv_ids, templates
+from ..views.markdown import arxiv_ids, template
 
 COMPARISONS = ("sft", "experience_replay", "frozen")
 """Methods whose rows are next to the method's own."""
@@ -95,7 +93,7 @@ def _contents(methods: Sequence[Description]) -> str:
     """Return the list of all methods by division."""
     divisions = {name: [one for one in methods if one.division == name] for name in DIVISIONS}
     present = {name: members for name, members in divisions.items() if members}
-    return _template("methods.md.jinja").render(divisions=present, common=common_hyper_parameters())
+    return template(__file__, "methods.md.jinja").render(divisions=present, common=common_hyper_parameters())
 
 
 def _page(method: Description, sources: Sources) -> str:
@@ -103,7 +101,7 @@ def _page(method: Description, sources: Sources) -> str:
     text, uses, scenario = method.text, method.cls.uses, sources.evidence.scenario
     papers = arxiv_ids(" ".join((text.idea, *text.rule)))
     names = [name for name in dict.fromkeys((method.name, *COMPARISONS)) if name in sources.rows]
-    return _template("method.md.jinja").render(
+    return template(__file__, "method.md.jinja").render(
         method=method,
         papers=papers,
         other_papers=[one for one in arxiv_ids(" ".join(text.details)) if one not in papers],
@@ -123,10 +121,6 @@ def _page(method: Description, sources: Sources) -> str:
         tried=[] if method.name in CONTROLS else _tried(method.name),
         commands=_commands(method.name, sources),
     )
-
-
-def _template(name: str) -> Template:
-    return templates(Path(__file__).with_name("templates")).get_template(name)
 
 
 def _diagnostics(method: Description, sources: Sources) -> dict[str, Estimate]:

@@ -37,9 +37,9 @@ from clbench.spec.scenario import Scenario
 from ..board.commands import run_command
 from ..board.rows import Board, Row
 from ..board.runs import differences
-from ..board.summary import METHODS, RANKED_BY
+from ..board.summary import METHODS, RANKED_BY, grouped
 from ..views.format import MISSING
-from ..views.markdown import templates
+from ..views.markdown import template
 from .scenario_spaces import spaces_of
 from .scenario_tasks import Experts, picture_path
 
@@ -135,8 +135,7 @@ class Card:
         references = [
             (row.method, [row.estimates[name] for name in COLUMNS], len(row.seeds)) for row in present
         ]
-        template = templates(Path(__file__).with_name("templates")).get_template("scenario.md.jinja")
-        return template.render(
+        return template(__file__, "scenario.md.jinja").render(
             scenario=self.scenario,
             typed=self.typed or self.scenario.id,
             groups=GROUPS | ({"target": OWN_ORDERS} if self.scenario.balanced else {}),
@@ -251,10 +250,7 @@ class Card:
 
     def _task_versions(self) -> dict[int, list[str]]:
         """Return the names of the tasks by their version."""
-        of_tasks: dict[int, list[str]] = {}
-        for task in self.scenario.tasks:
-            of_tasks.setdefault(task.version, []).append(task.name)
-        return dict(sorted(of_tasks.items()))
+        return dict(sorted(grouped((task.version, task.name) for task in self.scenario.tasks).items()))
 
 
 def _resolution(competing: Sequence[Row]) -> dict[str, list[float]]:

@@ -28,7 +28,7 @@ from clbench.records.paths import stage_folder
 from clbench.records.record import EpisodeRow
 from clbench.runs.run import pretrained_hash
 from clbench.runs.spec import check_device
-from clbench.runs.stages import kept_stages, load_stages, stage_policies
+from clbench.runs.stages import kept_stages, load_stages, make_stages
 from clbench.spec.protocol import Point
 
 from .subject import Check, Subject, some
@@ -65,7 +65,7 @@ def replay(subject: Subject, progress: ProgressCallback) -> list[Check]:
     kept = kept_stages(subject.resolved, subject.request.checkpoints)
     with deterministic(spec.device):
         if kept is None:
-            policies = stage_policies(subject.resolved, progress=progress)
+            policies = load_stages(subject.resolved, make_stages(subject.resolved, progress))
             checks = [Check("policies", "trained again", True)]
         else:
             policies = load_stages(subject.resolved, kept)

@@ -73,7 +73,7 @@ def placement(board: Board, run: ResolvedRun, records: Path) -> list[str]:
         lines.append(f"{method} has no row on the board of {scenario}.")
         if not refused:
             lines.append(f"There is no record of it in {records / folder}.")
-    lines += [f"Not shown: {entry.path}: {entry.reason}" for entry in refused]
+    lines += [f"Not shown: {entry}" for entry in refused]
     return lines
 
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 import hashlib
 import json
 import tempfile
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, is_dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -98,6 +98,8 @@ def verify(
             none = f"{_ACTORS[run.division]} has none, so its highest tier is recomputed"
             return [*checks, Check("policies", none, True)]
         found = looks[tier](subject, progress)
+        if tier != "recomputed":
+            found = _in_doubt(subject, found)
         if any(check.passed is False for check in found):
             verification_path(path).unlink(missing_ok=True)
         passed = all(check.passed for check in found)
@@ -108,6 +110,31 @@ def verify(
         if not passed:
             return checks + found
     return checks
+
+
+def _in_doubt(subject: Subject, checks: list[Check]) -> list[Check]:
+    """Return the checks of a repetition: with packages of other versions, a difference proves nothing."""
+    other = _other_versions(subject, subject.here["versions"])
+    if not other:
+        return checks
+    return [
+        check if check.passed else replace(check, found=f"{check.found}; {some(other)}", passed=None)
+        for check in checks
+    ]
+
+
+def _other_versions(subject: Subject, installed: Mapping[str, str]) -> list[str]:
+    """Return in words which of these packages a record was made with in another version.
+
+    A later clbench may score the same, as a later commit may: its version is not compared.
+    """
+    recorded = subject.run.record.fingerprint.get("versions")
+    before = recorded if isinstance(recorded, dict) else {}
+    return [
+        f"{package} was {before[package]} and is {version} here"
+        for package, version in installed.items()
+        if package != "clbench" and before.get(package, version) != version
+    ]
 
 
 def _digest(path: Path) -> str:
@@ -167,13 +194,7 @@ def _check_simulator(subject: Subject) -> Check:
 
 def _differs(subject: Subject, name: str, result: str) -> Check:
     """Return the check of what differs here: with another version of the simulator, it may be true there."""
-    recorded = subject.run.record.fingerprint.get("versions")
-    before = recorded if isinstance(recorded, dict) else {}
-    other = [
-        f"{package} was {before[package]} and is {version} here"
-        for package, version in simulator_versions(subject.scenario.tasks).items()
-        if before.get(package, version) != version
-    ]
+    other = _other_versions(subject, simulator_versions(subject.scenario.tasks))
     return Check(name, "; ".join([result, *other]), None if other else False)
 
 
@@ -273,8 +294,8 @@ def _check_origin(subject: Subject, again: Record) -> Check:
     theirs, ours = (_origin(record) for record in (subject.run.record, again))
     wrong = [f"{name} {theirs.get(name)} is {ours.get(name)} here" for name in differences(theirs, ours)]
     if wrong:
-        # on another machine, or with other packages, nobody can tell whether these are true
-        elsewhere = all(name.startswith(("versions ", "hardware ")) for name in differences(theirs, ours))
+        # this machine cannot tell what another one has
+        elsewhere = all(name.startswith("hardware ") for name in differences(theirs, ours))
         result = f"the record states what is not so here: {some(wrong)}"
         return Check("origin", result, None if elsewhere else False)
     methods = [record.fingerprint.get("method") for record in (subject.run.record, again)]
@@ -295,7 +316,7 @@ def _origin(record: Record) -> dict[str, Any]:
         values = record.fingerprint.get(part)
         entries = values if isinstance(values, dict) else {}
         found |= {f"{part} {name}": entries.get(name) for name in names or sorted(entries)}
-    found.pop("versions clbench", None)  # a later one may score the same, as its commit may
+    found.pop("versions clbench", None)
     return {**found, "pretrained": record.fingerprint.get("pretrained")}
 
 
@@ -347,18 +368,18 @@ def _job(path: Path, records: Path, request: Request, report: Path) -> Job:
             length += scenario.budget.pretraining_steps * request.pretrain
     except ClbenchError:
         pass  # the job itself reports the error
-    arguments = {"path": str(path), "records": str(records), "request": request, "report": str(report)}
+    arguments = {"path": path, "records": records, "request": request, "report": report}
     return Job(str(path), verify_job, arguments, length)
 
 
-def verify_job(path: str, records: str, request: Request, report: str, progress: ProgressCallback) -> str:
+def verify_job(path: Path, records: Path, request: Request, report: Path, progress: ProgressCallback) -> str:
     """Verify a record, write its checks to `report`, and return its tier with the checks in words."""
-    checks = verify(Path(path), Path(records), request, progress)
-    Path(report).write_text(json.dumps([asdict(check) for check in checks]), encoding="utf-8")
+    checks = verify(path, records, request, progress)
+    report.write_text(json.dumps([asdict(check) for check in checks]), encoding="utf-8")
     marks = {True: "ok ", False: "NOT", None: "?  "}
     text = "\n".join(f"  {marks[check.passed]} {check.name}: {check.found}" for check in checks)
     progress(1.0)
-    tier = tier_of(Path(path))
+    tier = tier_of(path)
     if not all(check.passed for check in checks):
         raise JobError(f"{tier}\n{text}")
     return f"{tier}\n{text}"

@@ -55,11 +55,18 @@ TO_CRITERION = (
 )
 """Metrics in the tables of scenarios whose stages end when the target is learned."""
 
-FITTING = ("final_average", "gain", "adaptation", "retention", "kept")
-"""Metrics of `TO_CRITERION` in a terminal of 108 columns."""
+FITTING_FIXED = (
+    "final_average",
+    "adaptation",
+    "retention",
+    "forgetting",
+    "forward_transfer",
+    "question_retention",
+)
+"""Metrics of `FIXED` in a terminal of 108 columns."""
 
-NOT_FITTING = ("perturbed_retention", "zero_shot")
-"""Metrics of `FIXED` for which a terminal of 108 columns has no room."""
+FITTING_TO_CRITERION = ("final_average", "gain", "adaptation", "retention", "kept")
+"""Metrics of `TO_CRITERION` in a terminal of 108 columns."""
 
 MISSING = "-"
 """Text for a value that could not be computed."""
@@ -111,10 +118,9 @@ def fitting(rows: Rows) -> tuple[Column, ...]:
     return tuple(one for one in shown(rows) if one.metric.name in names)
 
 
-def fitting_names(rows: Rows) -> list[str]:
+def fitting_names(rows: Rows) -> tuple[str, ...]:
     """Return the metrics of such columns, also those that no row has a value of."""
-    names = FITTING if _to_criterion(rows) else [name for name in FIXED if name not in NOT_FITTING]
-    return [name for name in names if name in METRICS]
+    return FITTING_TO_CRITERION if _to_criterion(rows) else FITTING_FIXED
 
 
 def _to_criterion(rows: Rows) -> bool:
@@ -262,6 +268,17 @@ def scaled(count: float) -> tuple[str, str]:
     # The rounded number decides: 999.9 k is 1 M.
     power = next((power for power, value in enumerate(digits) if value < 1000), len(units) - 1)
     return f"{digits[power]:g}" if power else number_text(count, ".0f"), units[power]
+
+
+def bytes_text(count: float) -> str:
+    """Return a number of bytes in three digits: "1.23 kB", or "0"."""
+    digits, prefix = scaled(count)
+    return f"{digits} {prefix}B" if count else "0"
+
+
+def times_text(ratio: float) -> str:
+    """Return a ratio with the sign of multiplication."""
+    return number_text(ratio, ".2f") + "\N{MULTIPLICATION SIGN}"
 
 
 def over_tied(name: str, words: str, gain: Estimate, tied: Sequence[TiedGain]) -> Iterator[str]:

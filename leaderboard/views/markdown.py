@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 
 from clbench.base.text import counted, printable
 from clbench.records.paths import table_parts
@@ -55,10 +55,9 @@ def markdown(board: Board, comparisons: Comparisons) -> str:
         board: The board.
         comparisons: What `compared.by_table` says of its rows.
     """
-    template = templates(Path(__file__).with_name("templates")).get_template("leaderboard.md.jinja")
     averages = overall(board.rows)
     by_scenario = tables_of(board.rows)
-    return template.render(
+    return template(__file__, "leaderboard.md.jinja").render(
         board=board,
         averages=averages,
         by_scenario=by_scenario,
@@ -105,8 +104,13 @@ def _ends(metric: Metric) -> list[str]:
 # ---- templates ---------------------------------------------------------------------------------------------
 
 
+def template(module: str, name: str) -> Template:
+    """Return a template in the folder `templates` beside a module, which gives its `__file__`."""
+    return _templates(Path(module).with_name("templates")).get_template(name)
+
+
 @cache
-def templates(folder: Path) -> Environment:
+def _templates(folder: Path) -> Environment:
     """Return the templates in `folder`, with the filters that Markdown pages need."""
     environment = Environment(
         loader=FileSystemLoader(folder),

@@ -111,7 +111,7 @@ def terminal(table: Summary, width: int = 108, sort: str | None = None) -> Rende
         parts.append(Text(LEGEND.format(lower=lower, tried=tried, tiers=tiers)))
     if table.not_shown:
         parts.append(Text("Not shown", style="bold"))
-        parts += [Text(f"  {entry.path}: {entry.reason}", overflow="fold") for entry in table.not_shown]
+        parts += [Text(f"  {entry}", overflow="fold") for entry in table.not_shown]
     return Group(*parts)
 
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from clbench.base.cache import cache_folder
-from clbench.cli.main import DEMONSTRATIONS, app
+from clbench.cli.data import DEMONSTRATIONS
+from clbench.cli.main import app
 from clbench.learning import pretraining
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 from eager import EAGER
+from helpers import stage_policies
 
 from clbench.base.cache import cache_folder
 from clbench.evaluation.checks import Checker
@@ -24,7 +25,7 @@ from clbench.records.writer import write_record
 from clbench.runs.length import run_length
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
-from clbench.runs.stages import keep_stage, stage_policies
+from clbench.runs.stages import keep_stage
 from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
 from clbench.spec.protocol import Point, check_steps

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from helpers import stage_policies
 from PIL import Image, ImageDraw
 
 from clbench.cli.film import film
@@ -29,7 +30,6 @@ from clbench.runs.film import (
 )
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
-from clbench.runs.stages import stage_policies
 from clbench.spec.registry import load_scenario
 from clbench.testing import ToyWorld
 from clbench.worlds.gl_backend import RenderingError, choose_back_end

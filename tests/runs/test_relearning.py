@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 from eager import EAGER
+from helpers import stage_policies
 
 from clbench.base.progress import no_progress
 from clbench.base.seeding import torch_generator
@@ -28,7 +29,6 @@ from clbench.runs.length import run_length
 from clbench.runs.relearning import relearn
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
-from clbench.runs.stages import stage_policies
 from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
 from clbench.spec.protocol import check_steps

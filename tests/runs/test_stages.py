@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from helpers import stage_policies
 from tiny import TINY
 from torch import Tensor
 
@@ -25,7 +26,7 @@ from clbench.policy.checkpoint import CheckpointError
 from clbench.policy.policy import Policy
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
-from clbench.runs.stages import find_stages, has_stages, keep_stages, load_stages, make_stages, stage_policies
+from clbench.runs.stages import find_stages, has_stages, keep_stages, load_stages, make_stages
 
 SPEC = RunSpec(TINY.id, "lora", seed=0)
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from clbench.base.entry_points import resolve
+from clbench.base.progress import ProgressCallback, no_progress
 from clbench.data.demonstrations import Demonstration
 from clbench.jobs.bars import Bars
 from clbench.learning.method import Method
@@ -24,6 +25,8 @@ from clbench.records.content import content_hash
 from clbench.records.paths import record_path
 from clbench.records.record import AnswerRow, EpisodeRow, PolicyRow, Record
 from clbench.records.writer import write_record
+from clbench.runs.spec import ResolvedRun
+from clbench.runs.stages import kept_stages, load_stages, make_stages
 from clbench.scoring.reading import read_protocol
 from clbench.spec.task import Task
 
@@ -147,3 +150,10 @@ def printed(bars: Bars) -> str:
     """Return what bars that draw into a text have printed."""
     assert isinstance(bars.console.file, io.StringIO)
     return bars.console.file.getvalue()
+
+
+def stage_policies(
+    run: ResolvedRun, checkpoints: Path | None = None, progress: ProgressCallback = no_progress
+) -> list[Policy]:
+    """Return the policy after every stage of a run: those that it kept below a folder, or made again."""
+    return load_stages(run, kept_stages(run, checkpoints) or make_stages(run, progress))

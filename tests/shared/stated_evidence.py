@@ -20,6 +20,9 @@ class Stated:
     def __init__(self, given: Given, runs: dict[str, Any] | None = None) -> None:
         self.given, self.runs, self.asked = given, runs or {}, set[str]()
 
+    def first_run(self, method: str) -> Any:
+        return next(iter(self.runs.get(method, {}).values()), None)
+
     def figure(self, what: str, quantity: Any, *methods: str, **_: Any) -> Any:
         self.asked.add(what)
         ends = self.given.get(what)

@@ -43,10 +43,8 @@ class Diagnostic:
     """One diagnostic of a method, by stage."""
 
     name: str
-    texts: tuple[str, ...]
-    """Text by stage."""
-    lines: tuple[str, ...]
-    """By stage, the points of a line in a box of 100 by 20; empty if it is not a series of numbers."""
+    cells: tuple[tuple[str, str], ...]
+    """By stage, a text and the points of a line in a box of 100 by 20, empty without a series of numbers."""
 
 
 @dataclass(frozen=True)
@@ -133,8 +131,7 @@ def diagnostics(runs: Sequence[Run]) -> Diagnostics:
     found = []
     for name in list(names)[:MOST]:
         series = [[values.get(stage, {}).get(name) for values in by_stage] for stage in stages]
-        texts, lines = zip(*map(_mean, series), strict=True)
-        found.append(Diagnostic(text_of(name), texts, lines))
+        found.append(Diagnostic(text_of(name), tuple(map(_mean, series))))
     return Diagnostics(tuple(map(text_of, stages)), tuple(found))
 
 

@@ -34,7 +34,7 @@ from .charts.picture import VEGA_LITE, in_both_themes
 from .charts.plane import FULL, NARROW, WIDE, Plane, plane, template
 from .charts.vega import FONT, PALETTE, SHAPES
 from .heat import COLUMNS, heat_maps
-from .rows import MAIN, SHADES
+from .rows import MAIN
 from .view import ScenarioView, scenarios, sorted_tables, table_title
 
 FOLDER = Path(__file__).parent
@@ -56,6 +56,9 @@ TIER_RULES = (
     "Every run was repeated as a whole.",
 )
 """How the rows of each tier were verified."""
+
+SHADES = 20
+"""Number of shades between success 0 and success 1."""
 
 CIVIDIS = (
     "#00204d",

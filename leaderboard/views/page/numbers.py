@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from clbench.scoring.intervals import Estimate
 
 from ...board.rows import Row
-from ..format import Column, number_text, scaled
+from ..format import Column, bytes_text, number_text, times_text
 
 MISSING = "\N{EN DASH}"
 """Text for a value that could not be computed."""
@@ -53,7 +53,7 @@ def cost(row: Row) -> Number:
     relative = row.costs["relative_cost"]
     if relative is None:
         return Number(MISSING, note="missing: its runs did not measure the time of a step, or sft has none")
-    return Number(number_text(relative, ".2f") + "\N{MULTIPLICATION SIGN}", number_text(relative, ".6f"))
+    return Number(times_text(relative), number_text(relative, ".6f"))
 
 
 def size(row: Row) -> Number:
@@ -61,6 +61,4 @@ def size(row: Row) -> Number:
     kept = row.costs["bytes_kept"]
     if kept is None:
         return Number(MISSING, note="missing: a record has no value")
-    digits, unit = scaled(kept)
-    text = f"{digits} {unit}B" if kept else "0"
-    return Number(text, number_text(kept, ".0f"), f"{number_text(kept, ',.0f')} bytes")
+    return Number(bytes_text(kept), number_text(kept, ".0f"), f"{number_text(kept, ',.0f')} bytes")

@@ -47,9 +47,6 @@ STEPS = {
 NAMED = 3
 """Number of methods not told apart from a row that are named; further ones are only counted."""
 
-SHADES = 20
-"""Number of shades between success 0 and success 1."""
-
 
 @dataclass(frozen=True)
 class MetricView:
@@ -68,10 +65,8 @@ class MatrixLine:
     """A row of the success matrix, mean over seeds."""
 
     name: str
-    texts: tuple[str, ...]
-    """Success rates by task."""
-    shades: tuple[int | None, ...]
-    """Shades by task, from 0 to `SHADES`."""
+    cells: tuple[tuple[str, float | None], ...]
+    """Text and success rate of each task."""
     learned: int | None
     """Column of the task that this stage learned."""
 
@@ -296,12 +291,10 @@ def _stages(row: Row) -> list[MatrixLine]:
     success = np.mean([run.scores.rates().success for run in row.runs], axis=0)
     stages = []
     for stage, line in enumerate(success):
-        values = [finite(value) for value in line]
         stages.append(
             MatrixLine(
                 printable(f"after {names[stage - 1]}") if stage else begin,
-                tuple(number_text(value, ".2f", MISSING) for value in values),
-                tuple(None if value is None else round(round(value, 9) * SHADES) for value in values),
+                tuple((number_text(value, ".2f", MISSING), value) for value in map(finite, line)),
                 len(layout.retained) + stage - 1 if stage else None,
             )
         )

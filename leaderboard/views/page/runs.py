@@ -114,7 +114,7 @@ def matrix_of(runs: Runs) -> Spec:
     }
     stages = ["pretrained", *(f"after {name}" for name in runs.targets)]
     success = np.mean([one.rates().success for one in runs.scores], axis=0)
-    return matrix(stages, groups, success, runs.title, FONT)
+    return matrix(stages, groups, success, runs.title)
 
 
 def curves_of(runs: Runs, sft: Runs | None) -> Spec:

@@ -98,7 +98,7 @@ def test_the_replayed_episodes_are_drawn_at_random_from_the_ends_of_all_stages(
     ("tier", "change", "message"),
     [
         ("replayed", {"hardware": {"instructions": "NEON"}}, "instructions of its processor: NEON, here: "),
-        ("retrained", {"versions": {"torch": "1.0"}}, "versions torch 1.0 is "),
+        ("retrained", {"versions": {"torch": "1.0"}}, "torch was 1.0 and is "),
         ("recomputed", {"versions": {"mujoco": "1.0"}, "rollouts": {}}, "mujoco was 1.0 and is "),
     ],
 )

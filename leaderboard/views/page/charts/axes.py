@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from clbench.scoring.intervals import Estimate
 
 from ....board.summary import METHODS, RowSummary
-from ...format import format_interval, number_text, scaled
+from ...format import bytes_text, format_interval, times_text
 from .vega import Spec, finite, rounded
 
 ROOM = 0.02
@@ -43,10 +43,7 @@ class Quantity:
         """Return a value in words."""
         if not self.is_cost or one.value is None:
             return format_interval(one)
-        if self.source == "bytes_kept":
-            digits, unit = scaled(one.value)
-            return f"{digits} {unit}B" if one.value else "0"
-        return number_text(one.value, ".2f") + "\N{MULTIPLICATION SIGN}"
+        return bytes_text(one.value) if self.source == "bytes_kept" else times_text(one.value)
 
 
 LEARNED = Quantity("learned", "adaptation", "success on each new task right after learning it")

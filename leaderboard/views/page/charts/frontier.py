@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from textwrap import wrap
 from typing import Any, TypeAlias
 
 from ....board.frontier import Curve, Rung
 from ....board.summary import DIVISIONS, WITH_DEMONSTRATIONS
 from ...format import format_interval, number_text
-from .vega import SYSTEM_FONT, Size, Spec, axis, colour, heading, layer, rounded, specification
+from .vega import SYSTEM_FONT, Size, Spec, axis, colour, heading, layer, rounded, specification, subtitle
 
 RATE_SHAPES = ("circle", "square", "triangle-up", "diamond", "cross", "triangle-down")
 """Shapes of the learning rates, the largest first."""
@@ -31,9 +30,6 @@ NARROW = Size(145, 145, 2)
 
 SPACING = {"row": 36, "column": 14}
 """Pixels between two panels: room for the name of the lower one."""
-
-LETTER = 6
-"""Mean width of a letter in pixels."""
 
 MEANINGS = (
     "to the right: learned, success on each target right after learning it",
@@ -78,9 +74,7 @@ def frontier(curves: Sequence[Curve], size: Size, font: str = SYSTEM_FONT) -> Sp
     look = _look([one for _, points in known for one in points], size)
     parts = [_group(title, members, baseline, look, size) for title, members in groups.items() if members]
     if parts:
-        letters = size.columns * (size.width + SPACING["column"]) // LETTER
-        lines = [line for text in MEANINGS for line in wrap(text, letters)]
-        parts[0]["title"] |= {"subtitle": lines, "subtitleColor": colour("muted"), "subtitleFontSize": 12}
+        parts[0]["title"] |= subtitle(MEANINGS, size.columns * (size.width + SPACING["column"]))
     spec = specification(font, vconcat=parts, spacing=28)
     spec["config"]["legend"]["layout"] = {"top": {"direction": "vertical", "anchor": "start", "margin": 8}}
     return spec

@@ -6,15 +6,13 @@ from collections.abc import Mapping, Sequence
 
 from clbench.scoring.layout import Array
 
-from .vega import Spec, colour, heading, rounded, specification
+from .vega import FONT, Spec, colour, heading, rounded, specification
 
 CELL = {"step": 56}, {"step": 30}
 """Width and height of a cell in pixels."""
 
 
-def matrix(
-    stages: Sequence[str], groups: Mapping[str, Sequence[str]], rates: Array, title: str, font: str
-) -> Spec:
+def matrix(stages: Sequence[str], groups: Mapping[str, Sequence[str]], rates: Array, title: str) -> Spec:
     """Return the chart of a success matrix; a frame marks the task that each stage learned.
 
     Args:
@@ -22,7 +20,6 @@ def matrix(
         groups: Names of the columns by group, in their order; the groups are those of a scenario.
         rates: Success rates, (stages, tasks), NaN where missing.
         title: Title of the chart.
-        font: Font of all texts.
     """
     tasks = [(group, name) for group, names in groups.items() for name in names]
     first = len(groups["retained"])
@@ -40,7 +37,7 @@ def matrix(
     column: Spec = {"field": "group", "sort": [*groups], "title": None, "spacing": 12}
     column["header"] = {"labelColor": colour("ink"), "labelFontSize": 12}
     return specification(
-        font,
+        FONT,
         title=heading(title),
         data={"values": cells},
         facet={"column": column},

@@ -7,13 +7,12 @@ on its size alone, and what fills its places, texts that begin with "@", for two
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from textwrap import wrap
 from typing import Any
 
 from ....board.summary import DIVISIONS, RowSummary
 from .axes import LEARNED, SKILLS, Axis, Quantity
 from .labels import LONGEST, Mark, place
-from .vega import FONT, SHAPES, SYSTEM_FONT, Size, Spec, colour, heading, layer, specification
+from .vega import FONT, SHAPES, SYSTEM_FONT, Size, Spec, colour, heading, layer, specification, subtitle
 
 FULL = Size(1050, 430, 6)
 """Size where the window has room for it."""
@@ -24,28 +23,22 @@ WIDE = Size(620, 400, 4)
 NARROW = Size(205, 320, 2)
 """Size on a phone."""
 
-LETTER = 6
-"""Mean width of a letter in pixels."""
-
 MEANING = "Thin lines: 95 % intervals, cut off at the edge. Dashed lines: Pareto front of a division."
 """What the marks do not say themselves."""
 
 
-def plane(rows: Sequence[RowSummary], size: Size, font: str = FONT, title: str = "") -> Spec:
+def plane(rows: Sequence[RowSummary], size: Size, title: str = "") -> Spec:
     """Return the plane of kept skills and learned tasks as a picture.
 
     Args:
         rows: Rows of one scenario.
         size: Size of the plane.
-        font: Font of all texts.
         title: Text above it.
     """
     drawn = Plane(rows, LEARNED, SKILLS)
     found = {str(point["division"]) for point in drawn.points}
-    spec: Spec = filled(template(size, font, found), drawn.places | drawn.labels(size))
-    lines = [line for text in (MEANING, drawn.note) for line in wrap(text, size.width // LETTER)]
-    above = {"subtitle": lines, "subtitleColor": colour("muted"), "subtitleFontSize": 12}
-    return {**spec, "title": heading(title) | above}
+    spec: Spec = filled(template(size, FONT, found), drawn.places | drawn.labels(size))
+    return {**spec, "title": heading(title) | subtitle((MEANING, drawn.note), size.width)}
 
 
 def filled(part: Any, places: Mapping[str, Any]) -> Any:

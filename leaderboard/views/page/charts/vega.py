@@ -7,8 +7,9 @@ without a new drawing. In a picture, the colours of one theme replace them.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from textwrap import wrap
 from typing import Any
 
 PALETTE: Mapping[str, tuple[str, str]] = {
@@ -37,6 +38,9 @@ FONT = "Liberation Sans, Arial, Helvetica, sans-serif"
 
 SYSTEM_FONT = "system-ui, sans-serif"
 """Font of the page."""
+
+LETTER = 6
+"""Mean width of a letter of a subtitle in pixels."""
 
 Spec = dict[str, Any]
 """A specification of Vega-Lite."""
@@ -100,6 +104,12 @@ def specification(font: str, **parts: Any) -> Spec:
 def heading(text: str) -> Spec:
     """Return the title of a chart."""
     return {"text": text, "anchor": "start", "color": colour("ink"), "fontSize": 13}
+
+
+def subtitle(texts: Iterable[str], width: int) -> Spec:
+    """Return what adds texts below a title, in lines that fit a width in pixels."""
+    lines = [line for text in texts for line in wrap(text, width // LETTER)]
+    return {"subtitle": lines, "subtitleColor": colour("muted"), "subtitleFontSize": 12}
 
 
 def axis(name: str, title: str, **rest: Any) -> Spec:
