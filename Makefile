@@ -4,7 +4,7 @@ BIN := .venv/bin
 SCENARIO := clbench/Fetch-v1
 QUICK := build/quick
 
-.PHONY: help leaderboard tuning records ladder controls unfinished docs site benchmark test test-long test-slow libero-test check wheel-test clean
+.PHONY: help leaderboard tuning records ladder controls docs site benchmark test test-long test-slow libero-test check wheel-test clean
 
 define HELP
 make leaderboard  install, run two methods with one seed, and show a table, in minutes
@@ -20,7 +20,6 @@ make tuning       missing tuning runs, and the settings of the methods
 make records      missing records of the boards, then the leaderboard
 make ladder       missing records of the ladder of learning rates
 make controls     missing records that only the claims need
-make unfinished   missing records of rows that are not complete yet
 make benchmark    speed, in two hours on an idle machine
 make clean        delete .venv, build and dist
 endef
@@ -73,7 +72,7 @@ records: .venv/installed-libero
 	$(BIN)/clbench run clbench/MetaWorld-v1 $(REFERENCES) $(METHODS) $(CONSFT_CONTROLS) --seeds 8
 	$(BIN)/clbench run clbench/PointMaze-v1 $(REFERENCES) $(MAZE) $(CONSFT_CONTROLS) --seeds 4
 	$(BIN)/clbench run $(KNOWLEDGE) frozen joint sft stop_gradient aegis lora --seeds 4
-	$(BIN)/clbench run clbench/LiberoSpatial-v1 experience_replay frozen sft --seeds 4
+	$(BIN)/clbench run clbench/LiberoSpatial-v1 experience_replay from_scratch frozen joint sft --seeds 4
 	$(BIN)/clbench run clbench/Fetch-v1 frozen sft consft aegis experience_replay lora stop_gradient --seeds 3 \
 		--policy discrete_diffusion
 	$(BIN)/clbench run clbench/Fetch-v1 sft experience_replay lora --seeds 1 --policy-size base
@@ -107,11 +106,6 @@ controls: .venv/installed-dev
 	$(BIN)/clbench run $(KNOWLEDGE) aegis --set.direction random $(CONTROLS)
 	$(BIN)/clbench run $(KNOWLEDGE) lora --set.rank 4 $(CONTROLS)
 	$(BIN)/clbench run $(KNOWLEDGE) lora --set.rank 64 $(CONTROLS)
-
-# Rows that have not all of their records yet, and are therefore not shown. They move to `records` together. A run takes
-# 15 to 40 minutes of one core.
-unfinished: .venv/installed-libero
-	$(BIN)/clbench run clbench/LiberoSpatial-v1 joint from_scratch --seeds 4 --records leaderboard/unfinished
 
 # The pages of docs/reference, from the code, the records and leaderboard/decoding.json; experts are measured once, and the
 # film is made once.

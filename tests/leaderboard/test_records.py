@@ -93,13 +93,6 @@ def test_the_records_beside_the_board_are_those_of_their_command(folder: str) ->
     assert set((ROOT / "leaderboard" / folder).rglob("*.json")) == promised(folder)
 
 
-def test_unfinished_rows_have_records_of_their_command_alone() -> None:
-    found = {path: read_record(path) for path in (ROOT / "leaderboard" / "unfinished").rglob("*.json")}
-    assert found.keys() < promised("unfinished")  # a row with all of its records is shown
-    assert not any(record.fingerprint["commit"]["dirty"] for record in found.values())
-    assert all(record.status == "success" for record in found.values())
-
-
 def test_the_pretrained_policy_has_its_skills_and_answers() -> None:
     retained = []
     for path in (RECORDS / "Fetch-v1" / "frozen").glob("*.json"):
