@@ -92,7 +92,7 @@ def set_aside(run: ResolvedRun, records: Path) -> str | None:
 def changed_code(record: Record, run: ResolvedRun) -> list[str]:
     """Return the names of the method and the policy, if their code is not that of a record any more.
 
-    Methods with a name of their own have versions; what is named "module:Class" is work in progress.
+    Methods with a name of their own have versions; a "module:Class" is work in progress.
     """
     from clbench.learning.registry import describe_method
 

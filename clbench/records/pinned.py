@@ -46,3 +46,19 @@ def other_parts(recorded: Any, known: Mapping[str, str]) -> list[str]:
     if recorded.keys() - known.keys() - later:
         return ["the tasks themselves"]
     return [name for name in known if name not in later and recorded.get(name) != known[name]]
+
+
+def other_versions(recorded: Any, installed: Mapping[str, str]) -> list[str]:
+    """Return in words which packages a record was made with in another version: "mujoco was 3.1 and is 3.2".
+
+    Args:
+        recorded: `fingerprint["versions"]` of a record, which a stranger may have written. A package that it
+            lacks is not known to differ.
+        installed: Versions by package.
+    """
+    before = recorded if isinstance(recorded, dict) else {}
+    return [
+        f"{name} was {before[name]} and is {version}"
+        for name, version in installed.items()
+        if before.get(name, version) != version
+    ]

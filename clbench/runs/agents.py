@@ -32,7 +32,7 @@ from clbench.evaluation.episodes import Episode, Trial
 from clbench.evaluation.examiner import episode_row
 from clbench.evaluation.players import Agent, TrainingEnv, acts_on_batches, play, training_of
 from clbench.records.paths import RECORDS, record_path
-from clbench.records.pinned import other_parts
+from clbench.records.pinned import other_parts, other_versions
 from clbench.records.reader import read_record
 from clbench.records.record import ONLINE_USES, AnswerRow, Record, RunInfo
 from clbench.records.writer import write_record
@@ -244,12 +244,8 @@ class StagedRun:
         ]
         if not other:
             return
-        before = then.get("versions")
-        versions = [
-            f", {name} was {before[name]} and is {version} now"
-            for name, version in simulator_versions(self.scenario.tasks).items()
-            if isinstance(before, dict) and before.get(name, version) != version
-        ]
+        changed = other_versions(then.get("versions"), simulator_versions(self.scenario.tasks))
+        versions = [f", {one} now" for one in changed]
         raise InputError(
             f"Stage {self.next_after(record) - 1} of {self} was evaluated with another version of the "
             f"scenario or its simulator: {', '.join(other)} differ{''.join(versions)}. Go back to it, "

@@ -43,11 +43,11 @@ INTRODUCTION = (
     "factor, because the published constants leave nearly all weights of this small policy at their floor. "
     "A claim on ConSFT holds by an arm that counts on its board, and fails only if both arms do. On "
     "clbench/Fetch-v1 no arm counts: one validation episode chose a factor whose weights hardly differ "
-    "(docs/history.md). On "
-    "clbench/MetaWorld-v1, most of the loss is in skills whose opposite or variant is a target, and "
-    "joint training loses some of it, too (docs/guide/metaworld.md): verdicts there say little about "
-    "skills that have nothing to do with the targets. A control is the method without the one ingredient "
-    "that is supposed to explain its success. `{missing}` marks a value that could not be computed."
+    "(docs/history.md). On clbench/MetaWorld-v1, most of the loss is in skills whose opposite or variant is "
+    "a target, and joint training loses some of it, too (docs/guide/metaworld.md): verdicts there say little "
+    "about skills that have nothing to do with the targets. A control is the method without the one "
+    "ingredient that is supposed to explain its success. `{missing}` marks a value that could not be "
+    "computed."
 )
 """Text above the table."""
 

@@ -28,7 +28,7 @@ from clbench.jobs.processes import Processes
 from clbench.jobs.scheduler import run_with_bars
 from clbench.learning.pretraining import pretrain
 from clbench.policy.checkpoint import save_policy
-from clbench.records.pinned import LATER, other_parts
+from clbench.records.pinned import LATER, other_parts, other_versions
 from clbench.records.reader import RecordError, UnreadableRecordError
 from clbench.records.record import Record, RunInfo, ScenarioInfo
 from clbench.runs.length import run_length
@@ -114,7 +114,9 @@ def verify(
 
 def _in_doubt(subject: Subject, checks: list[Check]) -> list[Check]:
     """Return the checks of a repetition: with packages of other versions, a difference proves nothing."""
-    other = _other_versions(subject, subject.here["versions"])
+    # a later clbench may score the same, as a later commit may
+    packages = {name: version for name, version in subject.here["versions"].items() if name != "clbench"}
+    other = _made_with(subject, packages)
     if not other:
         return checks
     return [
@@ -123,18 +125,10 @@ def _in_doubt(subject: Subject, checks: list[Check]) -> list[Check]:
     ]
 
 
-def _other_versions(subject: Subject, installed: Mapping[str, str]) -> list[str]:
-    """Return in words which of these packages a record was made with in another version.
-
-    A later clbench may score the same, as a later commit may: its version is not compared.
-    """
+def _made_with(subject: Subject, packages: Mapping[str, str]) -> list[str]:
+    """Return in words which of these packages a record was made with in another version."""
     recorded = subject.run.record.fingerprint.get("versions")
-    before = recorded if isinstance(recorded, dict) else {}
-    return [
-        f"{package} was {before[package]} and is {version} here"
-        for package, version in installed.items()
-        if package != "clbench" and before.get(package, version) != version
-    ]
+    return [f"{one} here" for one in other_versions(recorded, packages)]
 
 
 def _digest(path: Path) -> str:
@@ -194,7 +188,7 @@ def _check_simulator(subject: Subject) -> Check:
 
 def _differs(subject: Subject, name: str, result: str) -> Check:
     """Return the check of what differs here: with another version of the simulator, it may be true there."""
-    other = _other_versions(subject, simulator_versions(subject.scenario.tasks))
+    other = _made_with(subject, simulator_versions(subject.scenario.tasks))
     return Check(name, "; ".join([result, *other]), None if other else False)
 
 

@@ -51,6 +51,8 @@ class ScenarioView:
     """Gains over plain fine-tuning at settings that tuning rated as highly as the chosen one, by method."""
     start: str
     """Sentence on what the pretrained policy can do, empty if there is none."""
+    unpaired: str
+    """Sentence on rows that began with another pretrained policy than sft, empty if none did."""
     agreement: str
     """Sentence on how alike the seeds order the methods, empty if it is not known."""
     comparisons: tuple[Comparison, ...]
@@ -223,15 +225,8 @@ def scenarios(tables: Mapping[str, list[Row]], board: Board, comparisons: Compar
                 tuple(families(competing)) if len(competing) >= FEWEST else (),
                 board.frontiers.get(scenario, ()),
                 board.tied.get(scenario, {}),
-                " ".join(
-                    filter(
-                        None,
-                        (
-                            start_text(board.starts.get(scenario)),
-                            unpaired_text(board.unpaired.get(scenario)),
-                        ),
-                    )
-                ),
+                start_text(board.starts.get(scenario)),
+                unpaired_text(board.unpaired.get(scenario)),
                 agreement_text(board.agreements.get(scenario)),
                 comparisons.get(scenario, ()),
                 decoding if decoding and scenario == decoding.table else None,
