@@ -72,6 +72,25 @@ def machine_needed() -> Iterator[None]:
         ) from error
 
 
+@contextmanager
+def method_needed(run: ResolvedRun, trainer: Trainer) -> Iterator[None]:
+    """Raise what the method of a run inside does wrong as one error that names the place.
+
+    Raises:
+        CacheError, CheckpointError, LeaseLostError, MachineError, RenderingError: The machine is to blame.
+        MethodError: The method fails.
+    """
+    try:
+        with machine_needed():
+            yield
+    except NOT_THE_METHOD:
+        raise
+    except Exception as error:
+        place = place_of(error, trainer.where)
+        message = f"{run.label} failed in {place}: {type(error).__name__}: {error}"
+        raise MethodError(message) from error
+
+
 def find_stages(run: ResolvedRun, checkpoints: Path | None = None) -> Path | None:
     """Return the folder with the policies of all stages of a run, "stage-0" and so on, or None.
 
@@ -128,21 +147,14 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
                 checker.check(trainer.finished(), task, point)
             )
 
-        try:
-            with machine_needed():
-                if number:
-                    trainer.load(stage_folder(root, number - 1), number - 1)
-                    steps = trainer.learn(number, after)
-                    progress(scenario.budget.adaptation_steps - steps if scenario.budget.criterion else 0)
-                else:
-                    trainer.prepare(progress)
-                trainer.save(folder, trainer.state(number))
-        except NOT_THE_METHOD:
-            raise
-        except Exception as error:
-            place = place_of(error, trainer.where)
-            message = f"{run.label} failed in {place}: {type(error).__name__}: {error}"
-            raise MethodError(message) from error
+        with method_needed(run, trainer):
+            if number:
+                trainer.load(stage_folder(root, number - 1), number - 1)
+                steps = trainer.learn(number, after)
+                progress(scenario.budget.adaptation_steps - steps if scenario.budget.criterion else 0)
+            else:
+                trainer.prepare(progress)
+            trainer.save(folder, trainer.state(number))
 
     checker = Checker(scenario, run.protocol, run.spec.seed)
     with closing(checker), deterministic(run.spec.device):

@@ -28,7 +28,7 @@ from clbench.records.paths import stage_folder
 from clbench.records.record import EpisodeRow
 from clbench.runs.run import pretrained_hash
 from clbench.runs.spec import check_device
-from clbench.runs.stages import kept_stages, load_stages, make_stages
+from clbench.runs.stages import kept_stages, load_stages, make_stages, method_needed
 from clbench.spec.protocol import Point
 
 from .subject import Check, Subject, some
@@ -41,7 +41,11 @@ MISSED = 0.05
 
 
 def replay(subject: Subject, progress: ProgressCallback) -> list[Check]:
-    """Replay episodes of a record with the policies of its stages, and ask the questions again."""
+    """Replay episodes of a record with the policies of its stages, and ask the questions again.
+
+    Raises:
+        MethodError: The method fails when it is run again.
+    """
     run, spec = subject.run, subject.spec
     if subject.strange:
         options = " and ".join("--method" if name == run.method else "--policy" for name in subject.strange)
@@ -99,7 +103,8 @@ def _start(subject: Subject, first: Policy, progress: ProgressCallback) -> Check
     trainer = Trainer.open(
         subject.scenario, subject.resolved.new_method, subject.spec.seed, subject.spec.device
     )
-    trainer.prepare(progress)
+    with method_needed(subject.resolved, trainer):
+        trainer.prepare(progress)
     ours, theirs = trainer.policy.state_dict(), first.state_dict()
     same = ours.keys() == theirs.keys() and all(value.equal(theirs[name]) for name, value in ours.items())
     is_or_not = "is" if same else "is not"
@@ -183,7 +188,7 @@ def _go_on(subject: Subject, kept: Path, policies: Sequence[Policy]) -> Check:
     first, before, after = policies[0], policies[number - 1], policies[number]
     data = TrainingData.open(run.scenario, first.config)
     trainer = Trainer(run.scenario, data, first, run.new_method, run.spec.seed)
-    with deterministic(run.spec.device):
+    with deterministic(run.spec.device), method_needed(run, trainer):
         trainer.load(stage_folder(kept, number - 1), number - 1)
         trainer.learn(number, lambda step: step.done >= steps)
     moved, apart = _distance(before, after), _distance(trainer.policy, after)

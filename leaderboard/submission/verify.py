@@ -26,6 +26,7 @@ from clbench.data.demonstrations import simulator_versions
 from clbench.jobs.job import Job, JobError
 from clbench.jobs.processes import Processes
 from clbench.jobs.scheduler import run_with_bars
+from clbench.learning.optimise import MethodError
 from clbench.learning.pretraining import pretrain
 from clbench.policy.checkpoint import save_policy
 from clbench.records.pinned import LATER, other_parts, other_versions
@@ -97,7 +98,10 @@ def verify(
         if tier == "replayed" and run.division in ELSEWHERE:
             none = f"{_ACTORS[run.division]} has none, so its highest tier is recomputed"
             return [*checks, Check("policies", none, True)]
-        found = looks[tier](subject, progress)
+        try:
+            found = looks[tier](subject, progress)
+        except MethodError as error:
+            found = [Check("method", str(error), False)]
         if tier != "recomputed":
             found = _in_doubt(subject, found)
         if any(check.passed is False for check in found):
@@ -256,15 +260,14 @@ def _retrain(subject: Subject, progress: ProgressCallback) -> list[Check]:
         return before
     with tempfile.TemporaryDirectory() as folder:
         again = execute(subject.resolved, Path(folder), progress)
+    if again.failure:
+        return [*before, Check("whole run", f"it failed: {again.failure}", False)]
     wrong = []
     for part in PARTS:
         theirs, ours = (_as_dictionary(getattr(record, part)) for record in (subject.run.record, again))
         if theirs != ours:
             names = ", ".join(differences(theirs, ours))
             wrong.append(f"{part} ({names})" if names else part)
-    if again.error is not None:
-        failure = f"it failed: {again.error['type']}: {again.error['message']}"
-        return [*before, Check("whole run", failure, False)]
     if wrong:
         return [*before, Check("whole run", f"repeated, {', '.join(wrong)} differ", False)]
     equal = Check("whole run", f"repeated, equal in {', '.join(PARTS)}", True)

@@ -151,7 +151,7 @@ def unpaired_text(found: Mapping[str, Sequence[int]] | None) -> str:
     names = "; ".join(f"{method} (seeds {', '.join(map(str, seeds))})" for method, seeds in found.items())
     return (
         f"These runs began with another pretrained policy than sft's: {names}. Their gain compares unlike "
-        "runs: to mend it, run sft on the same kind of processor, with --records in a folder of its own."
+        "runs. To mend it, run sft and these methods on one machine with a new --records folder."
     )
 
 

@@ -160,6 +160,16 @@ def test_a_fault_that_only_the_whole_run_shows_is_found_by_doing_it_again(mine: 
     assert tiers.tier_of(mine) == "replayed"
 
 
+@pytest.mark.parametrize(("stage", "check"), [(2, "method: sft failed in"), (1, "whole run: it failed:")])
+def test_a_method_that_fails_when_it_is_repeated_denies_its_record(
+    stage: int, check: str, mine: Path, honest: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fail = lambda self, policy, about: policy.parameters() if about.number != stage else 1 / 0  # noqa: E731
+    monkeypatch.setattr("clbench.methods.sft.SFT.start_task", fail)  # a replay goes on with stage 2
+    found = failures(verify(mine, "retrained", honest))
+    assert found == f"{check} stage {stage} ({TARGETS[stage]}): ZeroDivisionError: division by zero"
+
+
 @pytest.mark.parametrize(("count", "looked_at"), [(90, 10), (1160, 40), (40, 40), (5, 1)])
 def test_the_least_lie_that_is_found_is_the_least_whose_chance_to_hide_is_5_percent(
     count: int, looked_at: int

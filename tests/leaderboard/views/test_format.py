@@ -86,6 +86,6 @@ def test_runs_that_did_not_begin_like_plain_fine_tuning_are_named_with_a_way_out
     assert unpaired_text(None) == ""
     assert unpaired_text({"mine:Mine": [1, 2], "lora": [3]}) == (
         "These runs began with another pretrained policy than sft's: mine:Mine (seeds 1, 2); lora (seeds 3). "
-        "Their gain compares unlike runs: to mend it, run sft on the same kind of processor, with --records "
-        "in a folder of its own."
+        "Their gain compares unlike runs. To mend it, run sft and these methods on one machine with "
+        "a new --records folder."
     )

@@ -35,6 +35,11 @@ class Quantity:
     is_cost: bool = False
     """Whether it is a cost: lower is better, and the axis is logarithmic."""
 
+    @property
+    def is_bytes(self) -> bool:
+        """Whether it counts bytes, of which many rows have none: its axis has a place for zero."""
+        return self.source == "bytes_kept"
+
     def of(self, row: RowSummary) -> Estimate:
         """Return the value of a row with its interval."""
         return Estimate(row.costs[self.source], None, None) if self.is_cost else row.estimates[self.source]
@@ -43,7 +48,7 @@ class Quantity:
         """Return a value in words."""
         if not self.is_cost or one.value is None:
             return format_interval(one)
-        return bytes_text(one.value) if self.source == "bytes_kept" else times_text(one.value)
+        return bytes_text(one.value) if self.is_bytes else times_text(one.value)
 
 
 LEARNED = Quantity("learned", "adaptation", "success on each new task right after learning it")
@@ -76,7 +81,7 @@ class Axis:
         least, most = min(ends, default=0.0), max(ends, default=1.0)
         if not quantity.is_cost:
             return cls(quantity, min(max(math.floor(least * 10 + 1e-9) / 10, 0.0), HIGHEST_LOW), 1.0)
-        if quantity.source == "bytes_kept":
+        if quantity.is_bytes:
             return cls(quantity, 0.0, max(most, NOT_ZERO) * 2)
         # The axis is logarithmic: a method that takes no steps has no place on it.
         positive = [end for end in ends if end > 0]
@@ -119,14 +124,14 @@ class Axis:
     def scale(self) -> Spec:
         """Its scale in Vega-Lite."""
         kind: Spec = {"domain": self._domain, "nice": False}
-        if self.quantity.source == "bytes_kept":
+        if self.quantity.is_bytes:
             return kind | {"type": "symlog", "constant": NOT_ZERO, "reverse": True}
         return kind | ({"type": "log", "reverse": True} if self.quantity.is_cost else {"zero": False})
 
     @property
     def marks(self) -> Spec:
         """Its ticks and labels in Vega-Lite."""
-        if self.quantity.source == "bytes_kept":
+        if self.quantity.is_bytes:
             # the format "~s" gives all ticks one prefix: 1 kB would read "0M"
             label = "datum.value ? replace(format(datum.value, '~s'), /([kMG])/, ' $1') + 'B' : '0'"
             return {"values": [0, 1e3, 1e6, 1e9], "labelExpr": label}
@@ -140,11 +145,11 @@ class Axis:
         return f"{name}: {self.quantity.meaning}" if is_long else name
 
     def _bent(self, value: float) -> float:
-        if self.quantity.source == "bytes_kept":
+        if self.quantity.is_bytes:
             return math.copysign(math.log1p(abs(value) / NOT_ZERO), value)
         return math.log(value) if self.quantity.is_cost else value
 
     def _straight(self, bent: float) -> float:
-        if self.quantity.source == "bytes_kept":
+        if self.quantity.is_bytes:
             return math.copysign(math.expm1(abs(bent)) * NOT_ZERO, bent)
         return math.exp(bent) if self.quantity.is_cost else bent
