@@ -11,7 +11,7 @@ make leaderboard  install, run two methods with one seed, and show a table, in m
 make test         most of the tests, in minutes
 make test-long    the tests that take a second and more, many of them whole runs
 make test-slow    the tests that take minutes each
-make check        format, lint, types, committed pages and definitions, the page in a browser, the benchmarks
+make check        format, lint, types, committed pages and definitions, the page in a browser
 make libero-test  install LIBERO (340 MB), and compare our world with it
 make wheel-test   build the wheel, and test it outside the clone
 make site         the documentation as a site: build/site/index.html
@@ -155,8 +155,8 @@ libero-test: .venv/installed-libero
 	$(BIN)/pytest tests/envs/test_every_scenario.py -k Libero
 
 # Besides style and types: whether the committed board and pages are those of the committed records, whether every scenario
-# is what its definition says, and the slow tests of what few change: the page in a browser, and the benchmarks.
-CHECKED := tests/leaderboard/test_records.py tests/evaluation/test_definition.py tests/test_benchmarks.py \
+# is what its definition says, and the page in a browser.
+CHECKED := tests/leaderboard/test_records.py tests/evaluation/test_definition.py \
 	tests/scoring/test_statistics_page.py tests/base/test_source.py \
 	$(addprefix tests/leaderboard/views/page/test_,in_browser.py on_a_phone.py published_page.py ways.py)
 check: .venv/installed-dev
@@ -168,9 +168,9 @@ check: .venv/installed-dev
 # Tests of the built wheel outside the checkout, where it could differ from the checkout: its files, the parts that are
 # found by name, the commands, and all that strangers type. It has an environment of its own, which sees the packages of
 # .venv but not the checkout: to install PyTorch a second time took 90 s.
-WHEEL_TESTS := $(addprefix tests/,cli/test_main.py cli/test_scaffold.py leaderboard/pages leaderboard/submission/test_submit.py \
-	leaderboard/views/page/test_html.py leaderboard/views/test_markdown.py runs/test_agents_guide.py serving/test_guide.py \
-	test_package.py test_readme.py test_submission.py test_your_scenario.py) \
+WHEEL_TESTS := $(addprefix tests/,cli/test_main.py cli/test_scaffold.py leaderboard/pages/test_cli.py \
+	leaderboard/views/test_markdown.py runs/test_agents_guide.py serving/test_guide.py test_package.py test_readme.py \
+	test_submission.py test_your_scenario.py) \
 	tests/methods/test_methods.py::test_the_link_of_a_method_is_the_first_paper_that_its_module_names
 wheel-test: .venv/installed-dev
 	rm -rf build/wheel && mkdir -p build/wheel
@@ -186,19 +186,23 @@ wheel-test: .venv/installed-dev
 clean:
 	rm -rf .venv build dist
 
-.venv/installed: pyproject.toml constraints.txt
-	test -x $(BIN)/pip || $(PYTHON) -m venv .venv
-	$(BIN)/pip install -q -c constraints.txt -e .
+$(BIN)/pip:
+	$(PYTHON) -m venv .venv
+
+# Each adds an extra. Python compiles what it imports: to compile every module of PyTorch and SciPy here took 40 s.
+INSTALL := $(BIN)/pip install -q --no-compile -c constraints.txt -e
+.venv/installed: pyproject.toml constraints.txt | $(BIN)/pip
+	$(INSTALL) .
 	@touch $@
 
-.venv/installed-dev: .venv/installed
-	$(BIN)/pip install -q -c constraints.txt -e ".[dev]"
-	@touch $@
+.venv/installed-dev: pyproject.toml constraints.txt | $(BIN)/pip
+	$(INSTALL) ".[dev]"
+	@touch .venv/installed $@
 
 .venv/installed-libero: .venv/installed-dev
-	$(BIN)/pip install -q -c constraints.txt -e ".[dev,libero]"
+	$(INSTALL) ".[dev,libero]"
 	@touch $@
 
 .venv/installed-docs: .venv/installed
-	$(BIN)/pip install -q -c constraints.txt -e ".[docs]"
+	$(INSTALL) ".[docs]"
 	@touch $@
