@@ -36,7 +36,7 @@ def _cluster() -> Iterator[Any]:
     try:
         yield cluster
     finally:
-        cluster.shutdown()  # type: ignore[no-untyped-call]
+        cluster.shutdown()
 
 
 def _kill(processes: list[psutil.Process]) -> None:
