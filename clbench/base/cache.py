@@ -30,12 +30,15 @@ LOG = logging.getLogger("clbench")
 MANIFEST = "clbench.json"
 """File of an entry that lists its inputs, and its other files with their hashes."""
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
-"""Errors of a disk on which nothing can be written."""
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE)
+"""Errors of a machine that has no room for a file, or none for an open one."""
+
+FAILING = (errno.EIO, errno.ESTALE, errno.EROFS, errno.ETIMEDOUT, errno.EHOSTDOWN)
+"""Errors of a disk, or of the network to a shared folder."""
 
 
 class CacheError(ClbenchError, OSError):
-    """The file system refused to keep a result: the disk is full, or the folder may not be written."""
+    """The file system refused to keep or read a result: a disk is full or fails, a folder is read-only."""
 
 
 def cache_folder() -> Path:
@@ -123,7 +126,8 @@ def _explained(folder: Path) -> Iterator[None]:
     except CacheError:  # of another result, which `make` needs
         raise
     except (OSError, SafetensorError) as error:
-        if isinstance(error, OSError) and error.errno not in _FULL and not _is_on_the_way(error, folder):
+        is_here = not isinstance(error, OSError) or _is_on_the_way(error, folder)
+        if not is_here and error.errno not in NO_ROOM + FAILING:
             raise
         reason = getattr(error, "strerror", None) or error
         raise CacheError(f"{folder} cannot be written: {reason}.") from error
@@ -138,24 +142,39 @@ def _is_on_the_way(error: OSError, folder: Path) -> bool:
 
 
 def is_cached(folder: Path, inputs: Mapping[str, Any]) -> bool:
-    """Return whether `folder` is whole and was made from `inputs`."""
+    """Return whether `folder` is whole and was made from `inputs`.
+
+    Raises:
+        CacheError: The machine fails while it reads.
+    """
     return fault_of(folder, inputs) is None
 
 
 def fault_of(folder: Path, inputs: Mapping[str, Any]) -> str | None:
-    """Return why `folder` cannot serve as the result of `inputs`, as the end of a sentence, or None."""
+    """Return why `folder` cannot serve as the result of `inputs`, as the end of a sentence, or None.
+
+    Raises:
+        CacheError: The machine fails while it reads.
+    """
     return _fault(folder, hash_of(inputs))
 
 
 def _fault(folder: Path, key: str) -> str | None:
-    """Return the fault of `folder`, or None."""
+    """Return the fault of `folder`, or None.
+
+    Raises:
+        CacheError: The machine fails while it reads: what is there may be whole, and stays.
+    """
     try:
         manifest = read_json(folder / MANIFEST)
         if manifest["inputs"] != key:
             return "was made from other inputs"
         if manifest["files"] != _file_hashes(folder):
             return "is torn: its files are not those that were written"
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        refused = error if isinstance(error, OSError) else error.__cause__  # of `read_json`
+        if isinstance(refused, OSError) and refused.errno in NO_ROOM + FAILING:
+            raise CacheError(f"{folder} cannot be read now: {refused.strerror}.") from error
         return "is torn or foreign: it has no readable manifest"
     return None
 

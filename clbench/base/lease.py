@@ -104,8 +104,12 @@ class Lease:
     def release(self) -> None:
         """Give the lease back, if this process has it."""
         if self._lock.is_locked and not self._is_lost():
-            _report_path(self._path).unlink(missing_ok=True)
+            self._remove_report()
         self._lock.release()
+
+    def _remove_report(self) -> None:
+        with contextlib.suppress(OSError):  # a folder that fails must not end the work
+            _report_path(self._path).unlink(missing_ok=True)
 
     def report(self, share: float) -> None:
         """Tell others how far the work is, every `REPORT_SECONDS` at most."""
@@ -123,8 +127,7 @@ class Lease:
         """Remove the lease of a dead process, and its report; return whether nobody holds the lease."""
         if self._lock.owner is None:  # no lease, or a file that someone else put there
             if not self._file.exists():
-                with contextlib.suppress(OSError):
-                    _report_path(self._path).unlink(missing_ok=True)
+                self._remove_report()
             return True
         if self.take():
             self.release()

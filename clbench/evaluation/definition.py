@@ -36,7 +36,7 @@ from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task, packages_of
 from clbench.worlds.camera import load_camera
-from clbench.worlds.lanes import vector_world
+from clbench.worlds.lanes import is_perturbable, vector_world
 
 CODE = (*DATA_SOURCES, "clbench.evaluation.definition", "clbench.evaluation.rules")
 """Code that a definition depends on, besides the suites of the tasks."""
@@ -121,7 +121,7 @@ def _hash_of_task(task: Task) -> tuple[str, NDArray[np.float32]]:
     """Return the hash of a task, and the states of its fixed episodes."""
     digest = hashlib.sha256(json.dumps(_words(task)).encode())
     states = []
-    for perturbed in (False, True) if _is_perturbable(task) else (False,):
+    for perturbed in (False, True) if is_perturbable(task) else (False,):
         for moment in _moments(task, perturbed):
             digest.update(b"".join(np.asarray(part, np.float32).tobytes() for part in moment))
             states.append(moment[0])
@@ -132,11 +132,6 @@ def _words(task: Task) -> list[object]:
     """Return what defines a task besides its behaviour."""
     wordings = [list(task.instructions), list(task.test_instructions)]
     return [task.name, task.seed_suite, task.version, task.horizon, task.action_noise, wordings]
-
-
-def _is_perturbable(task: Task) -> bool:
-    world = resolve(task.world)
-    return bool(getattr(getattr(world, "vector_world", None) or world, "perturbable", False))
 
 
 def _moments(task: Task, perturbed: bool) -> Iterator[tuple[NDArray[Any], ...]]:

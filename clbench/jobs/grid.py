@@ -99,7 +99,7 @@ def run_missing(
         check: Job that must succeed before anything else is done; its limits hold for the runs, too.
 
     Raises:
-        InputError: A folder cannot be written to, a record is of another definition of its scenario, or this
+        InputError: A record is of another definition of its scenario, or this
             machine cannot render what a scenario needs.
     """
     sweep(records, cache_folder(), minari_folder() / "clbench")
@@ -112,7 +112,6 @@ def run_missing(
     if not any(to_do):
         return {}
     begin = time.monotonic()
-    check_folders({"--records": records, "--checkpoints": checkpoints, "--tensorboard": tensorboard})
     plan = to_do.plan(records, checkpoints, tensorboard, check)  # refuses a camera where nothing can render
     pool = workers()  # refuses a cluster that does not answer
     for one in to_do.runs:
@@ -232,10 +231,10 @@ def run_specs(firsts: Sequence[RunSpec], seeds: int, records: Path, workers: int
     console = lines_console()
     typed = [run for run in runs if run.spec.method.startswith("__main__:")]
     others = [run for run in runs if not run.spec.method.startswith("__main__:")]
+    if not all(has_record(run, records) for run in runs):
+        check_folders({"records": records})
     # other processes cannot import the class, but can make what its runs need
-    needed = [
-        job for job in missing(typed, records, None).plan(records, None).jobs if "spec" not in job.arguments
-    ]
+    needed = missing(typed, records, None).plan(records, None).inputs
     failed = run_with_bars(needed, Processes(workers), console) if needed else {}
     failed |= run_missing(others, records, lambda: Processes(workers), console) if others else {}
     failed |= run_missing(typed, records, Here, console) if typed else {}

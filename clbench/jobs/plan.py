@@ -53,14 +53,16 @@ class Plan:
         self._runs: list[Job] = []
 
     @property
+    def inputs(self) -> list[Job]:
+        """The jobs that need no method: data, and pretrained policies."""
+        kinds = (self._target_data, self._questions, self._retained_data, self._policies)
+        return [job for kind in kinds for job in kind.values() if job is not None]
+
+    @property
     def jobs(self) -> list[Job]:
         """All jobs; those that every run waits for come first."""
-        shared = (self._target_data, self._questions, self._retained_data, self._policies, self._starts)
-        return [
-            *self._first,
-            *(job for kind in shared for job in kind.values() if job is not None),
-            *self._runs,
-        ]
+        starts = [job for job in self._starts.values() if job is not None]
+        return [*self._first, *self.inputs, *starts, *self._runs]
 
     def add_run(
         self,

@@ -201,8 +201,16 @@ class ScenarioInfo:
     balanced: bool = False
     """Whether each seed has its own order of the targets: see `clbench.spec.scenario.balanced_order`."""
 
-    def protocol(self, run: RunInfo, ends: tuple[int, ...] | None = None) -> Protocol:
-        """Return the evaluation protocol of a run on this scenario, whose stages had the steps `ends`."""
+    def protocol(
+        self, split: ScoredSplit = "test", perturb: bool = False, ends: tuple[int, ...] | None = None
+    ) -> Protocol:
+        """Return the evaluation protocol of a run on this scenario.
+
+        Args:
+            split: The split that is scored.
+            perturb: Whether the retained skills and each stage's target also meet perturbed episodes.
+            ends: Steps of each stage of a finished run; None before it, or if all stages are equally long.
+        """
         return Protocol(
             tuple(self.retained),
             tuple(self.target),
@@ -211,8 +219,8 @@ class ScenarioInfo:
             self.budget["validation_episodes"],
             self.budget["test_episodes"],
             self.budget["curve_episodes"],
-            run.split,
-            run.perturb,
+            split,
+            perturb,
             self.budget.get("criterion"),
             ends,
         )

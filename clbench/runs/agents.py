@@ -332,7 +332,6 @@ class StagedRun:
         if stage == 0:
             if record is not None:
                 LOG.warning("%s starts over: its stages 0 to %d are dropped.", self, following - 1)
-                self.unfinished.unlink()
             return self._new_record(settings or {}, agent)
         assert record is not None  # some stage precedes
         if settings not in (None, record.run.settings):
@@ -341,7 +340,6 @@ class StagedRun:
         if stage < following:
             LOG.warning("%s: its stages %d to %d are dropped.", self, stage, following - 1)
             _drop(record, stage)
-            write_record(record, self.unfinished)
         return record
 
     def _new_record(self, settings: dict[str, Any], agent: Any) -> Record:
@@ -360,15 +358,19 @@ class StagedRun:
         record.timing = {"started": datetime.now(UTC).isoformat(timespec="seconds"), "stages": []}
         return record
 
+    @cached_property
+    def _protocol(self) -> Protocol:
+        """The protocol that every run follows."""
+        return describe_scenario(self.scenario).protocol()
+
     def trials(self, stage: int) -> list[Trial]:
         """Return the episodes that every run plays at the end of a stage."""
-        protocol = Protocol.of(self.scenario)
-        keys = protocol.episodes(protocol.end(stage))
+        keys = self._protocol.episodes(self._protocol.end(stage))
         return [Trial(self.scenario.task(key.task), key.split, key.number) for key in keys]
 
     def report(self, record: Record, stage: int, episodes: Iterable[Episode]) -> None:
         """Add the outcomes of the trials of a stage, and answers to no questions."""
-        point = Protocol.of(self.scenario).end(stage)  # in optimiser steps, as if a method had trained
+        point = self._protocol.end(stage)  # in optimiser steps, as if a method had trained
         for episode in episodes:
             record.add_episode(episode_row(point, episode))
         for kind in resolve(self.scenario.questions):

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from clbench.base.errors import InputError, WrongTypeError
 from clbench.base.text import counted, did_you_mean
@@ -56,10 +56,15 @@ class RunSpec:
     """Name of the policy, see `clbench.spec.policies`."""
 
     def __post_init__(self) -> None:
-        for name, hint in (("scenario", "its id"), ("method", "its name or 'module:Class'")):
+        hints = {"scenario": "its id", "method": "its name or 'module:Class'", "device": "such as 'cpu'"}
+        for name, hint in hints.items():
             value = getattr(self, name)
             if not isinstance(value, str):
                 raise WrongTypeError(f"{name} of a run must be a string, {hint}, not {value!r}.")
+        if self.split not in get_args(ScoredSplit):
+            raise InputError(f'split of a run must be "test" or "validation", not {self.split!r}.')
+        if type(self.perturb) is not bool:
+            raise WrongTypeError(f"perturb of a run must be True or False, not {self.perturb!r}.")
         check_whole(self, 0, "seed", "order", most=LARGEST_SEED)
         if self.targets is not None:
             check_whole(self, 1, "targets")
@@ -133,7 +138,7 @@ class ResolvedRun:
     @cached_property
     def protocol(self) -> Protocol:
         """The evaluation protocol of the run."""
-        return Protocol.of(self.scenario, self.spec.split, self.spec.perturb)
+        return self.scenario_info.protocol(self.spec.split, self.spec.perturb)
 
     @cached_property
     def info(self) -> RunInfo:

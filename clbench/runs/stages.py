@@ -7,7 +7,6 @@ itself bit for bit, so policies that are made again equal the original ones.
 from __future__ import annotations
 
 import dataclasses
-import errno
 import functools
 import logging
 import shutil
@@ -16,7 +15,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clbench.base.cache import CacheError, cache_folder, cached, hash_of, is_cached
+from clbench.base.cache import FAILING, NO_ROOM, CacheError, cache_folder, cached, hash_of, is_cached
 from clbench.base.errors import ClbenchError
 from clbench.base.lease import LeaseLostError
 from clbench.base.progress import ProgressCallback, no_progress
@@ -37,12 +36,6 @@ if TYPE_CHECKING:
 
 LOG = logging.getLogger("clbench")
 
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE)
-"""Errors of a machine that has no room for a file, or none for an open one."""
-
-_FAILING = (errno.EIO, errno.ESTALE, errno.EROFS, errno.ETIMEDOUT, errno.EHOSTDOWN)
-"""Errors of a disk, or of the network to a shared folder."""
-
 
 class MachineError(ClbenchError, OSError):
     """While a method ran, the machine had no room for a file, or its disk or network failed."""
@@ -62,9 +55,9 @@ def machine_needed() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno not in _NO_ROOM + _FAILING:
+        if error.errno not in NO_ROOM + FAILING:
             raise
-        full = error.errno in _NO_ROOM
+        full = error.errno in NO_ROOM
         fault, mend = ("has no room", "make room") if full else ("failed", "mend it")
         raise MachineError(
             f"The machine {fault}: {error}. The method is not to blame, and the run leaves no record: "

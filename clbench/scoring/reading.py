@@ -57,7 +57,7 @@ def read_protocol(record: Record) -> Protocol:
     if criterion is None:
         if any(record.checks.values()):
             raise RecordError("checks: its budget has no criterion that could have been checked.")
-        return scenario.protocol(record.run)
+        return scenario.protocol(record.run.split, record.run.perturb)
     if not _is_number(criterion, 1) or len(scenario.evaluation_steps) != 1:
         raise RecordError("scenario: a criterion must be a success rate, with one evaluation step.")
     if record.run.trained_elsewhere:  # it chose its own steps; its stages count as full ones
@@ -66,7 +66,7 @@ def read_protocol(record: Record) -> Protocol:
         ends = tuple(scenario.evaluation_steps * len(scenario.target))
     else:
         ends = _read_ends(record)
-    return scenario.protocol(record.run, ends)
+    return scenario.protocol(record.run.split, record.run.perturb, ends)
 
 
 def _read_ends(record: Record) -> tuple[int, ...]:
@@ -75,7 +75,7 @@ def _read_ends(record: Record) -> tuple[int, ...]:
     Raises:
         RecordError: A check is impossible, or a stage does not end with its criterion or its last step.
     """
-    protocol = record.scenario.protocol(record.run)
+    protocol = record.scenario.protocol(record.run.split, record.run.perturb)
     by_stage: dict[int, list[CheckRow]] = {stage: [] for stage in protocol.stages[1:]}
     for number, row in enumerate(record.check_rows()):
         where = f"checks: row {number}"

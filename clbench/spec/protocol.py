@@ -9,10 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, NamedTuple
-
-if TYPE_CHECKING:
-    from clbench.spec.scenario import Scenario
+from typing import Literal, NamedTuple
 
 Split = Literal["validation", "test", "perturbed"]
 """Purpose of an episode. Choices may look at validation episodes; scores are made of test episodes alone. A
@@ -104,33 +101,6 @@ class Protocol:
     """Success rate on the target's validation episodes that ends a stage before its last step."""
     ends: tuple[int, ...] | None = None
     """Steps of each stage of a finished run; None if all stages are equally long, or before the run."""
-
-    @classmethod
-    def of(cls, scenario: Scenario, split: ScoredSplit = "test", perturb: bool = False) -> Protocol:
-        """Return the protocol of a run on `scenario`.
-
-        Args:
-            scenario: Scenario with the targets that are learned, in their order.
-            split: The split that is scored.
-            perturb: Whether the retained skills and each stage's target also meet perturbed episodes.
-        """
-        budget = scenario.budget
-        retained, target, held_out = (
-            tuple(task.name for task in group)
-            for group in (scenario.retained, scenario.target, scenario.held_out)
-        )
-        return cls(
-            retained,
-            target,
-            held_out,
-            budget.evaluation_steps,
-            budget.validation_episodes,
-            budget.test_episodes,
-            budget.curve_episodes,
-            split,
-            perturb,
-            budget.criterion,
-        )
 
     @property
     def tasks(self) -> tuple[str, ...]:

@@ -176,7 +176,9 @@ def _play(task: Task, world: World, seed: int, act: Any) -> _Episode:
         if action.shape != world.action_space.shape or not np.isfinite(action).all():
             raise ScenarioError(f"{where}: the action of {task.expert} must be in {world.action_space}.")
         actions.append(action.clip(-1, 1))
-        state, reward, done, _, info = world.step(actions[-1])
+        state, reward, done, truncated, info = world.step(actions[-1])
+        if truncated:
+            raise ScenarioError(f"{where}: the world truncates, but only the task's horizon may do so.")
         if np.shares_memory(state, states[-1]):
             raise ScenarioError(
                 f"{where}: the world gives the array of its last state again, changed: return a copy."

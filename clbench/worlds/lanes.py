@@ -16,7 +16,7 @@ from clbench.spec.task import Task
 from clbench.worlds.camera import VIEW_SIZE, Images
 from clbench.worlds.observation import Observer
 from clbench.worlds.perturbation import draw_perturbation
-from clbench.worlds.world import Outcomes, States, VectorWorld, World
+from clbench.worlds.world import Outcomes, States, VectorWorld, World, checked_actions
 
 
 class PlainVectorWorld:
@@ -50,6 +50,7 @@ class PlainVectorWorld:
     def step(self, lanes: Sequence[int], actions: NDArray[np.float32]) -> Outcomes:
         """Move each of `lanes`, none twice, by its row of actions (N, A)."""
         outcomes = []
+        actions = checked_actions(actions, self.single_action_space, "plain", len(lanes))
         for lane, action in zip(lanes, actions, strict=True):
             world = self._worlds[lane]
             if world is None:
@@ -82,6 +83,12 @@ def vector_world(entry_point: str, lanes: int, threads: int = 1, perturbed: bool
     return own(lanes, threads, **options)
 
 
+def is_perturbable(task: Task) -> bool:
+    """Return whether the world of a task, or its suite's own vector world, declares itself perturbable."""
+    world = resolve(task.world)
+    return bool(getattr(getattr(world, "vector_world", None) or world, "perturbable", False))
+
+
 def check_perturbable(tasks: Iterable[Task]) -> None:
     """Refuse tasks whose worlds cannot be perturbed.
 
@@ -89,9 +96,8 @@ def check_perturbable(tasks: Iterable[Task]) -> None:
         InputError: The world of a task does not declare itself perturbable; the message says what to do.
     """
     for task in tasks:
-        world = resolve(task.world)
-        own = getattr(world, "vector_world", None)
-        if not getattr(own or world, "perturbable", False):
+        if not is_perturbable(task):
+            own = getattr(resolve(task.world), "vector_world", None)
             what = f"the vector world of {task.world}" if own else task.world
             raise InputError(
                 f"The task {task.name!r} cannot be perturbed: {what} does not declare `perturbable = True`. "

@@ -18,7 +18,7 @@ from clbench.spec.task import Task
 from clbench.worlds.gl_backend import draw_without_display
 from clbench.worlds.observation import Observer
 from clbench.worlds.schedule import InstructionFormat, Schedule, Start
-from clbench.worlds.world import World
+from clbench.worlds.world import World, checked_actions
 
 Observation = dict[str, Any]
 
@@ -29,15 +29,19 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     `reset()` begins the next episode of the schedule: `episodes_per_stage` episodes of stage 0, in which the
     retained tasks take turns, if there are any, then as many of each target task. The last one never ends.
     `reset(seed=...)` restarts the schedule. `reset(options={"stage": k})` continues from the start of a
-    stage, and `reset(options={"task": name})` chooses any task for one episode.
+    stage, and `reset(options={"task": name})` chooses any task for one episode. With `task=name` all episodes
+    have that task.
 
     Observation: a dictionary of `state`, float32 (S,), from the task's world, and `instruction`, text, or
     with `instruction="tokens"` the word ids, int64 (L,), for agents that need numbers. Where the task has a
     camera, `state` holds only the numbers that a policy may see, and `image`, uint8 (N, N, 3), the picture.
     Action: float32 (A,), from -1 to 1, clipped; a number that is not finite is refused.
-    Reward: the task's dense reward. An episode is terminated by success and truncated at the task's horizon.
-    Info: `task`, `stage`, `instruction`, `success`. A copy made by pickle is a new environment, which begins
-    with its own first `reset()`.
+    Reward: that of the task's world: dense, but sparse on LIBERO. An episode is terminated by success and
+    truncated at the task's horizon.
+    Info: `task`, `stage`, `instruction`, `success`. The stage is 0 for all tasks that no stage trains;
+    `scenario.group(info["task"])` tells which part of the scenario a task belongs to. The wordings are those
+    of training: `clbench.evaluate_agent` and `clbench score` also play episodes with test wordings. A copy
+    made by pickle is a new environment, which begins with its own first `reset()`.
 
     Args:
         scenario: Scenario, or its entry point "module:attribute".
@@ -45,6 +49,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         episodes_per_stage: Episodes after which `reset()` goes on to the next stage.
         stage: Stage to stay in, for an agent that is trained stage by stage; None goes through all stages.
         order: Order of the targets, see `Scenario.in_order`; 0 is the published order.
+        task: Name of the only task, for example to evaluate one skill; None has those of the stages.
         render_mode: "rgb_array" or None, passed on to the worlds.
 
     Raises:
@@ -60,9 +65,10 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         episodes_per_stage: int = 100,
         stage: int | None = None,
         order: int = 0,
+        task: str | None = None,
         render_mode: str | None = None,
     ) -> None:
-        self._arguments = (scenario, instruction, episodes_per_stage, stage, order, render_mode)
+        self._arguments = (scenario, instruction, episodes_per_stage, stage, order, task, render_mode)
         self.scenario = opened_scenario(scenario, order)
         self.render_mode = render_mode
         self.instruction: InstructionFormat = instruction
@@ -71,17 +77,17 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Steps since the environment was made."""
         self.begun_at: float | None = None
         """Start of the first episode in seconds, by `time.perf_counter`."""
-        self._schedule = Schedule(self.scenario, episodes_per_stage, instruction, stage)
+        self._schedule = Schedule(self.scenario, episodes_per_stage, instruction, stage, task)
         self._worlds: dict[str, World] = {}
         self._observers: dict[str, Observer] = {}
         self._begun: Start | None = None
-        self._steps = 0
-        task = self.scenario.tasks[0]
-        world = self._world(task)
+        self._steps, self._ended = 0, False
+        first = self.scenario.tasks[0]
+        world = self._world(first)
         self.metadata = {**self.metadata, "render_fps": world.metadata.get("render_fps", 25)}
         assert isinstance(world.observation_space, spaces.Box)
         self.action_space = world.action_space
-        shown = self._observers[task.world].spaces(world.observation_space)
+        shown = self._observers[first.world].spaces(world.observation_space)
         self.observation_space = spaces.Dict({**shown, "instruction": self._schedule.instruction_space})
 
     def __getstate__(self) -> dict[str, Any]:  # Gymnasium's EzPickle forgets the spec
@@ -94,7 +100,9 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def _world(self, task: Task) -> World:
         """Return the world of a task, which is made on first use."""
         if task.world not in self._worlds:
-            self._worlds[task.world] = resolve(task.world)(render_mode=self.render_mode)
+            # a world that cannot draw need not know the argument
+            options = {} if self.render_mode is None else {"render_mode": self.render_mode}
+            self._worlds[task.world] = resolve(task.world)(**options)
             self._observers[task.world] = Observer(task.world, task.camera)
         return self._worlds[task.world]
 
@@ -112,7 +120,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         if seed is not None:
             self._schedule.begin()
         self._begun = start = self._schedule.next(self.np_random, options or {})
-        self._steps = 0
+        self._steps, self._ended = 0, False
         state, _ = self._world(start.task).reset(seed=start.seed, options={"task": start.task.name})
         return self._observation(state), start.info(False)
 
@@ -127,13 +135,18 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Take one step of the current task.
 
         Raises:
-            ResetNeeded: There was no `reset` yet.
+            ResetNeeded: There was no `reset` yet, or the episode has ended.
             InputError: The action has another shape than the action space, or a number in it is not finite.
         """
-        state, reward, terminated, _, _ = self._world(self._start.task).step(action)
+        task = self._start.task
+        if self._ended:  # a success would be counted again
+            raise gymnasium.error.ResetNeeded(f"The episode of {self.scenario.id} has ended: call reset().")
+        (checked,) = checked_actions(np.asarray(action)[None], self.action_space, self.scenario.id, 1)
+        state, reward, terminated, _, _ = self._world(task).step(checked)
         self._steps += 1
         self.steps_taken += 1
-        truncated = not terminated and self._steps >= self._start.task.horizon
+        truncated = not terminated and self._steps >= task.horizon
+        self._ended = terminated or truncated
         return self._observation(state), float(reward), terminated, truncated, self._start.info(terminated)
 
     def _observation(self, state: NDArray[np.float32]) -> Observation:

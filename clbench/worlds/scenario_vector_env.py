@@ -42,6 +42,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         episodes_per_stage: Episodes after which an environment goes on to the next stage.
         stage: Stage to stay in, for an agent that is trained stage by stage; None goes through all stages.
         order: Order of the targets, see `Scenario.in_order`; 0 is the published order.
+        task: Name of the only task; None has those of the stages.
         threads: Threads that step the worlds, by default one per core. Results do not depend on it.
         render_mode: None; environments side by side cannot be drawn.
 
@@ -59,10 +60,11 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         episodes_per_stage: int = 100,
         stage: int | None = None,
         order: int = 0,
+        task: str | None = None,
         threads: int | None = None,
         render_mode: str | None = None,
     ) -> None:
-        self._arguments = (scenario, num_envs, instruction, episodes_per_stage, stage, order, threads)
+        self._arguments = (scenario, num_envs, instruction, episodes_per_stage, stage, order, task, threads)
         if render_mode is not None:
             raise InputError(
                 "Many environments side by side cannot be drawn. Draw one with gymnasium.make(...), or give "
@@ -79,7 +81,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         self.begun_at: float | None = None
         """Start of the first episodes in seconds, by `time.perf_counter`."""
         self._schedules = [
-            Schedule(self.scenario, episodes_per_stage, instruction, stage) for _ in range(num_envs)
+            Schedule(self.scenario, episodes_per_stage, instruction, stage, task) for _ in range(num_envs)
         ]
         self._generators: list[np.random.Generator] = [np_random()[0] for _ in range(num_envs)]
         self._lanes = Lanes(num_envs, threads or cores())
@@ -116,7 +118,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
 
         Args:
             seed: Seed of the first environment, from which the others count up, or a seed or None for each.
-            options: Options of `ScenarioEnv.reset`, for all environments.
+            options: Options of `ScenarioEnv.reset`, for all environments. A task holds for one episode.
 
         Raises:
             UnknownNameError: The scenario has no such task.

@@ -24,7 +24,7 @@ class Start:
 
     task: Task
     stage: int
-    """Stage that trains the task; 0 for retained and held-out tasks."""
+    """Stage that trains the task; 0 for tasks that no stage trains."""
     instruction: str
     """One of the task's wordings."""
     observed_instruction: Any
@@ -50,6 +50,7 @@ class Schedule:
         episodes_per_stage: Episodes after which the next stage begins.
         instruction: Form of the instruction in observations, "text" or "tokens".
         stage: Stage that it never leaves; None goes through all stages.
+        task: Name of the only task of its episodes; None goes through the tasks of the stages.
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class Schedule:
         episodes_per_stage: int,
         instruction: InstructionFormat,
         stage: int | None = None,
+        task: str | None = None,
     ) -> None:
         if instruction not in ("text", "tokens"):
             raise InputError(f'instruction must be "text" or "tokens", not {instruction!r}.')
@@ -66,10 +68,14 @@ class Schedule:
                 f"episodes_per_stage must be a whole number, at least 1, not {episodes_per_stage!r}."
             )
         self._scenario, self._episodes_per_stage, self._format = scenario, episodes_per_stage, instruction
-        self._stage, self._episode = stage, -1
+        self._stage, self._task, self._episode = stage, task, -1
         self._first = 0 if scenario.retained else 1
+        if stage is not None and task is not None:
+            raise InputError("Give stage or task, not both: a task has its stage.")
         if stage is not None:
             self._check_stage(stage)
+        if task is not None:
+            self._choose({})
 
     @property
     def instruction_space(self) -> spaces.Space[Any]:
@@ -77,7 +83,7 @@ class Schedule:
         if self._format == "tokens":
             return spaces.Box(0, VOCABULARY_SIZE - 1, (self._scenario.text_length,), np.int64)
         tasks = (*self._scenario.tasks, *self._scenario.background)
-        texts = [words for task in tasks for words in task.instructions]
+        texts = [words for task in tasks for words in task.instructions + task.test_instructions]
         characters = {*string.ascii_lowercase, " ", *"".join(texts)}
         return spaces.Text(max_length=max(map(len, texts)), charset="".join(sorted(characters)))
 
@@ -104,10 +110,12 @@ class Schedule:
     def _choose(self, options: Mapping[str, Any]) -> tuple[Task, int]:
         """Return task and stage of the next episode."""
         scenario = self._scenario
-        if "task" in options:
-            if not isinstance(options["task"], str):
-                raise InputError(f'The option "task" must be a name, not {options["task"]!r}.')
-            task = scenario.task(options["task"])
+        name = options.get("task", self._task)
+        if name is not None:
+            if not isinstance(name, str):
+                which = 'The option "task"' if "task" in options else "task"
+                raise InputError(f"{which} must be a name, not {name!r}.")
+            task = scenario.task(name)
             return task, scenario.target.index(task) + 1 if task in scenario.target else 0
         if "stage" in options:
             self._check_stage(options["stage"])

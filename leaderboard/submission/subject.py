@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from clbench.learning.registry import method_names
 from clbench.runs.fingerprint import fingerprint
-from clbench.runs.spec import ResolvedRun, RunSpec
+from clbench.runs.spec import ResolvedRun, RunSpec, describe_scenario
 from clbench.scoring.reading import read_protocol
 from clbench.spec.policies import is_built_in
 from clbench.spec.protocol import Protocol
@@ -111,8 +111,8 @@ class Subject:
     @property
     def protocol(self) -> Protocol:
         """The evaluation protocol of the run, with the ends of its stages."""
-        planned = Protocol.of(self.scenario, self.spec.split, self.spec.perturb)
-        return replace(planned, ends=read_protocol(self.run.record).ends)
+        ends = read_protocol(self.run.record).ends
+        return describe_scenario(self.scenario).protocol(self.spec.split, self.spec.perturb, ends)
 
     @cached_property
     def here(self) -> dict[str, Any]:

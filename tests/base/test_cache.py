@@ -1,5 +1,10 @@
+import errno
+import io
 import logging
+import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -52,6 +57,33 @@ def test_a_torn_or_foreign_folder_is_logged_and_made_again(
     assert str(folder) in caplog.text
     assert fault in caplog.text
     assert [path.name for path in tmp_path.iterdir()] == ["x"]
+
+
+@pytest.mark.parametrize("name", ["clbench.json", "value.txt"])
+def test_a_result_that_cannot_be_read_now_is_kept(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[str] = []
+    _value(tmp_path / "x", INPUTS, "first", calls)
+    for module, function in ((os, "open"), (io, "open")):
+        monkeypatch.setattr(module, function, _stale(getattr(module, function), name))
+    with pytest.raises(CacheError, match="x cannot be read now: Stale file handle"):
+        _value(tmp_path / "x", INPUTS, "second", calls)
+    with pytest.raises(CacheError, match="x cannot be read now: Stale file handle"):
+        is_cached(tmp_path / "x", INPUTS)
+    monkeypatch.undo()
+    assert _value(tmp_path / "x", INPUTS, "third", calls) == "first"
+
+
+def _stale(usual: Callable[..., Any], name: str) -> Callable[..., Any]:
+    """Return a function that opens files as on a shared folder that lost the one called `name`."""
+
+    def opened(path: Any, *arguments: Any, **options: Any) -> Any:
+        if Path(str(path)).name == name:
+            raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), str(path))
+        return usual(path, *arguments, **options)
+
+    return opened
 
 
 def test_a_result_of_other_inputs_is_made_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -1,5 +1,6 @@
 """Leases, with owners in other processes."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -164,6 +165,23 @@ def test_a_report_does_not_follow_a_link(tmp_path: Path) -> None:
     assert lease.progress is None
     lease.release()
     assert (tmp_path / "mine").read_text() == "mine"
+
+
+def test_a_report_that_cannot_be_removed_does_not_keep_the_lease(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, missing_ok: bool = False) -> None:
+        if path.name.endswith(".progress"):
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+        usual(path, missing_ok)
+
+    usual = Path.unlink
+    lease = Lease(tmp_path / "x")
+    assert lease.take()
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", refuse)
+        lease.release()
+    assert Lease(tmp_path / "x").take()
 
 
 def test_the_name_of_an_owners_machine_controls_no_terminal() -> None:

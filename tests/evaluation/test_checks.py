@@ -10,8 +10,9 @@ from torch import Tensor
 from clbench.evaluation.checks import Checker
 from clbench.policy.policy import Policy
 from clbench.records.record import CheckRow
+from clbench.runs.spec import describe_scenario
 from clbench.spec.language import encode
-from clbench.spec.protocol import Point, Protocol
+from clbench.spec.protocol import Point
 from clbench.testing import TOY
 from clbench.testing.small import SMALL
 
@@ -49,7 +50,7 @@ class Obeying(Policy):
 def test_a_check_ends_when_its_outcome_is_certain(
     understood: tuple[str, ...], episodes: int, successes: int
 ) -> None:
-    checker, policy = Checker(FIVE, Protocol.of(FIVE), seed=0), Obeying(SMALL)
+    checker, policy = Checker(FIVE, describe_scenario(FIVE).protocol(), seed=0), Obeying(SMALL)
     policy.understood = understood
     row = checker.check(policy, FIVE.task("left"), Point(1, 4))
     checker.close()

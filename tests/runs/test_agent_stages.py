@@ -80,7 +80,9 @@ def test_new_code_of_learning_and_another_pytorch_discard_no_stage(
         ),
         (
             "clbench.runs.agents.describe_scenario",
-            lambda scenario: dataclasses.replace(describe_scenario(scenario), budget={}),
+            lambda scenario: dataclasses.replace(
+                describe_scenario(scenario), budget={**dataclasses.asdict(scenario.budget), "batch_size": 99}
+            ),
             "budget differ",
         ),
     ],
@@ -116,6 +118,16 @@ def test_evaluating_stage_0_again_starts_over(
     evaluate(Knowing(*LEARNED[0]), stage_env(0))
     assert "me/knows, seed 0, on clbench/Toy-v0 starts over: its stages 0 to 1 are dropped." in caplog.text
     assert next_stage(ID, method="me/knows", records=tmp_path / "records") == 1
+
+
+def test_starting_over_with_an_agent_that_cannot_act_loses_no_stage(
+    evaluate: Callable[..., Any], tmp_path: Path
+) -> None:
+    for stage in range(2):
+        evaluate(Knowing(), stage_env(stage))
+    with pytest.raises(ValueError, match="action has the shape"):
+        evaluate(lambda _: [0.0], stage_env(0))
+    assert next_stage(ID, method="me/knows", records=tmp_path / "records") == 2
 
 
 KILLED = """

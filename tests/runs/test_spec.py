@@ -83,6 +83,10 @@ def test_a_wrong_name_or_value_is_refused_before_any_work(
         ({"seed": 0.5}, "seed must be a whole number, not 0.5"),
         ({"order": -1}, "order must be at least 0, not -1"),
         ({"targets": 0}, "targets must be at least 1, not 0"),
+        ({"split": "validaton"}, 'split of a run must be "test" or "validation", not \'validaton\''),
+        ({"split": "train"}, "split of a run must be"),
+        ({"perturb": 1}, "perturb of a run must be True or False, not 1"),
+        ({"device": 0}, "device of a run must be a string, such as 'cpu', not 0"),
     ],
 )
 def test_an_impossible_run_is_refused_where_it_is_built(fields: dict[str, Any], message: str) -> None:

@@ -19,9 +19,9 @@ from helpers import blocks_of
 from served import SERVER
 
 from clbench.base.errors import ClbenchError, MissingPackageError
+from clbench.runs.spec import describe_scenario
 from clbench.serving.client import ServedPolicy
 from clbench.spec.identifiers import scenario_ids
-from clbench.spec.protocol import Protocol
 from clbench.spec.registry import load_scenario, registered_scenario
 
 PAGE = Path(__file__).parents[2] / "docs" / "guide" / "external.md"
@@ -93,7 +93,7 @@ def test_the_sizes_on_the_page_are_those_of_the_scenario(row: tuple[str, ...]) -
     assert env.action_space.shape == (int(action),)
     size = picture.partition(" x ")[0]
     assert spaces.get("image") == (None if picture == "-" else (int(size), int(size), 3))
-    protocol = Protocol.of(scenario)
+    protocol = describe_scenario(scenario).protocol()
     stages = range(len(scenario.target) + 1)
     counts = [len(list(protocol.episodes(protocol.end(stage)))) for stage in stages]
     assert (min(counts), max(counts)) == (int(fewest), int(most or fewest))

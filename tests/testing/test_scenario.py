@@ -79,6 +79,21 @@ class Lost(ToyWorld):
         return state, float("nan"), *rest
 
 
+class Limited(ToyWorld):
+    """It ends its episodes by itself, after three steps."""
+
+    steps = 0
+
+    def reset(self, **options: Any) -> Any:
+        self.steps = 0
+        return super().reset(**options)
+
+    def step(self, action: Any) -> Any:
+        self.steps += 1
+        state, reward, success, _, info = super().step(action)
+        return state, reward, success, self.steps == 3, info
+
+
 class Strong(ToyWorld):
     """Its actions go beyond 1."""
 
@@ -167,6 +182,7 @@ def test_the_toy_passes() -> None:
         ("Mute", r'terminated is True, info\["success"\] is None'),
         ("Giving", "doing nothing completes it"),
         ("Lost", "step 0: the reward is nan"),
+        ("Limited", "step 2: the world truncates, but only the task's horizon may do so"),
         ("Strong", "actions must go from -1 to 1"),
         ("Framed", "observation space must be a Box of one axis"),
         ("Askew", "side by side its episodes differ"),

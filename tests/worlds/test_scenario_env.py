@@ -252,6 +252,71 @@ print(frame.shape, frame.std() > 10)
     assert result.stdout.strip() == "(480, 480, 3) True", result.stderr
 
 
+@pytest.mark.parametrize(("task", "stage"), [("up", 0), ("right", 1), ("up_left", 0)])
+def test_an_environment_of_one_task_never_leaves_it(task: str, stage: int) -> None:
+    env = gymnasium.make("clbench.testing:clbench/Toy-v0", task=task, episodes_per_stage=1)
+    infos = [env.reset(seed=3)[1]] + [env.reset()[1] for _ in range(3)]
+    assert [(info["task"], info["stage"]) for info in infos] == [(task, stage)] * 4
+    many = gymnasium.make_vec("clbench.testing:clbench/Toy-v0", num_envs=2, task=task, episodes_per_stage=1)
+    many.reset(seed=0)
+    for _ in range(100):  # episodes end after 20 steps
+        *_, info = many.step(np.zeros((2, 2), np.float32))
+        assert list(info["task"]) == [task] * 2
+
+
+def test_one_task_is_a_known_name_and_excludes_a_stage() -> None:
+    with pytest.raises(LookupError, match="Did you mean 'left'"):
+        _toy(task="lefft")
+    with pytest.raises(ValueError, match="stage or task, not both"):
+        _toy(task="left", stage=0)
+
+
+def test_a_step_after_the_end_of_an_episode_is_refused_and_not_counted() -> None:
+    env = _toy(task="left")
+    env.reset(seed=0)
+    ended = False
+    while not ended:
+        _, _, terminated, truncated, _ = env.step(np.array([-1, 0], np.float32))
+        ended = terminated or truncated
+    steps = env.steps_taken
+    with pytest.raises(gymnasium.error.ResetNeeded, match="has ended: call reset"):
+        env.step(np.array([-1, 0], np.float32))
+    assert env.steps_taken == steps
+    env.reset()
+    env.step(np.array([-1, 0], np.float32))
+
+
+@pytest.mark.parametrize("action", [np.zeros(1), 0.0, np.zeros((1, 2)), np.array([np.nan, 0])])
+def test_an_action_of_another_shape_or_of_no_numbers_is_refused_for_any_world(action: Any) -> None:
+    env = _toy()
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="An action of the clbench/Toy-v0 world"):
+        env.step(action)
+    many = gymnasium.make_vec("clbench.testing:clbench/Toy-v0", num_envs=2)
+    many.reset(seed=0)
+    with pytest.raises(ValueError, match="action"):
+        many.step(np.stack([np.zeros(2), np.full(2, np.nan)]))
+
+
+class Undrawn(ToyWorld):
+    """A world that cannot be drawn, and takes no render mode."""
+
+    def __init__(self) -> None:
+        super().__init__()
+
+
+def test_a_world_that_cannot_be_drawn_needs_no_render_mode(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("clbench.testing.ToyWorld", Undrawn)
+    assert _toy().reset(seed=0)[1]["task"] == "left"
+
+
+def test_the_space_of_instructions_holds_test_wordings_too() -> None:
+    words = ("move 2 the far left side of this large and very empty square plain",)
+    tasks = tuple(dataclasses.replace(task, test_instructions=words) for task in TOY.retained)
+    env = ScenarioEnv(dataclasses.replace(TOY, retained=tasks))
+    assert env.observation_space["instruction"].contains(words[0])  # type: ignore[index]
+
+
 def test_a_pickled_environment_is_a_new_one_with_the_same_options() -> None:
     env = gymnasium.make("clbench.testing:clbench/Toy-v0", instruction="tokens", stage=1, order=1)
     env.reset(seed=5)
