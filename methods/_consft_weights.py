@@ -104,7 +104,7 @@ class WeightedSFT(Method, ABC):
 
 @dataclass
 class CalibratedSFT(WeightedSFT, ABC):
-    """Fine-tune on a weighted loss; inside the weights it has the unit of the published constants."""
+    """Fine-tune on a weighted loss, which is scaled inside the weights: its unit differs between policies."""
 
     loss_scale: float = 0.003
 

@@ -43,12 +43,13 @@ def shown(task: Task, episodes: Sequence[Demonstration]) -> Iterator[Shown]:
 
 
 def steps_per_second(task: Task) -> float:
-    """Return the control rate of a task's world.
+    """Return the control rate of a task in its world.
 
     Raises:
         InputError: The world gives no rate.
     """
     with closing(resolve(task.world)()) as world:
+        world.reset(seed=0, options={"task": task.name})  # a world may have a rate for each task
         rate = world.metadata.get("render_fps")
     if rate is None:
         raise InputError(

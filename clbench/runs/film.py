@@ -315,6 +315,7 @@ def column_of(run: ResolvedRun, stage: int, *, alone: bool) -> str:
 def frames_per_second(task: Task) -> int:
     """Return the speed of a task's films: that of its world, at most `FASTEST`; 25 if it has none."""
     with closing(resolve(task.world)()) as world:
+        world.reset(seed=0, options={"task": task.name})  # a world may have a rate for each task
         return min(int(world.metadata.get("render_fps", 25)), FASTEST)
 
 

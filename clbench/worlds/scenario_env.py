@@ -86,7 +86,8 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         world = self._world(first)
         self.metadata = {**self.metadata, "render_fps": world.metadata.get("render_fps", 25)}
         assert isinstance(world.observation_space, spaces.Box)
-        self.action_space = world.action_space
+        assert isinstance(world.action_space, spaces.Box)
+        self.action_space = self._actions = world.action_space
         shown = self._observers[first.world].spaces(world.observation_space)
         self.observation_space = spaces.Dict({**shown, "instruction": self._schedule.instruction_space})
 
@@ -141,7 +142,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         task = self._start.task
         if self._ended:  # a success would be counted again
             raise gymnasium.error.ResetNeeded(f"The episode of {self.scenario.id} has ended: call reset().")
-        (checked,) = checked_actions(np.asarray(action)[None], self.action_space, self.scenario.id, 1)
+        (checked,) = checked_actions(np.asarray(action)[None], self._actions, self.scenario.id, 1)
         state, reward, terminated, _, _ = self._world(task).step(checked)
         self._steps += 1
         self.steps_taken += 1

@@ -107,6 +107,11 @@ class DMControlVectorWorld:
             episode.data.geom_xpos[model.geom("target").id][:2] = mark
         return Drawable(model, episode.data, episode.start.body.camera)
 
+    def steps_per_second(self, lane: int) -> float:
+        """Return the control rate of a lane's body: 25, or 6.25 for the point mass."""
+        start = self._lane(lane).episode.start
+        return round(1 / float(start.model.opt.timestep * start.body.substeps), 6)
+
     def close(self) -> None:
         """End the threads."""
         self._team.close()

@@ -26,6 +26,7 @@ from .claim import (
 )
 from .evidence import SHARE, Evidence, Figure
 from .figures import (
+    anchor_ratio,
     answer_curve,
     drift_ratio,
     early_success,
@@ -208,6 +209,7 @@ def keeps_answers(evidence: Evidence) -> Finding:
             "Length and learning rate of this scenario were chosen so that sft loses answers (A1), and aegis "
             "was not tuned here: it may keep answers at smaller rates.",
             *_when_lost(evidence, "aegis"),
+            *_near_the_anchor(anchor_ratio(evidence), "batches near the anchor need not keep the answers"),
             not_told_apart(
                 gains[0],
                 explains="the projection need not keep any answer",
@@ -280,11 +282,24 @@ def _of_stages(evidence: Evidence, name: str, what: str, stage: int | None = Non
 def removes_drift(evidence: Evidence) -> Finding:
     """Removes the cumulative drift of activations."""
     aegis, at_random = (drift_ratio(evidence, method) for method in ("aegis", "aegis+direction=random"))
+    near = anchor_ratio(evidence)
     return Finding(
         decided(holds=aegis.high < 0.5, fails=aegis.low > 0.5),
         (aegis,),
-        (at_random,),
-        change=what_would_change(aegis, 0.5),
+        (at_random, near),
+        _near_the_anchor(near, "the drift on questions, which the rule judges, is another quantity"),
+        what_would_change(aegis, 0.5),
+    )
+
+
+def _near_the_anchor(near: Figure, but: str) -> tuple[str, ...]:
+    """Return a sentence if the projection certainly keeps the robot's batches nearer to the anchor."""
+    if not near.high < 0.5:
+        return ()
+    figure = f"{near.value:.3f} [{near.low:.3f}, {near.high:.3f}]"
+    return (
+        "The projection acts: at the end of the first stage, the distance of the robot's batch to the anchor "
+        f"is {figure} of that with a random direction; {but}.",
     )
 
 

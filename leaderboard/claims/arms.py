@@ -10,11 +10,11 @@ from .evidence import Evidence, Figure
 from .figures import share_afterwards, share_between
 
 ARMS = ("consft", "consft_calibrated")
-"""The published loss with a tuned first temperature; the published constants, with the loss in their unit."""
+"""The published loss with a tuned first temperature; the same with a tuned factor of the loss."""
 
 LEAST_BETWEEN = 0.1
 """Share of the weights between 0.01 and 0.9, before the last tenth of the schedule, from which an arm counts.
-Below it, most samples of most steps weigh alike: nothing, which Adam cancels, or 1."""
+Below it, most samples of most steps weigh alike: almost nothing, which Adam nearly cancels, or 1."""
 
 NEEDS_WEIGHTS = "Weights that differ between samples while the temperature is low."
 """What would change a verdict without an arm that counts."""

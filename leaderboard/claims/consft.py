@@ -302,7 +302,7 @@ def bounds_the_risk_of_a_step(evidence: Evidence) -> Finding:
         (
             "The paper's risk of a gradient g is g'Fg, with the Fisher matrix F of the old knowledge. The "
             "weight is a factor of g, so the risk contains its square: by algebra, whatever the records say. "
-            "This does not cover the sum of many steps: Adam cancels a factor that all samples share.",
+            "This does not cover the sum of many steps: Adam nearly cancels a factor that all samples share.",
         ),
         "Nothing: it is algebra.",
         about=ARMS,

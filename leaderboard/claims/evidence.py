@@ -216,6 +216,25 @@ class Evidence:
 
         return self._mean_of(method, what, values, ".2f", span)
 
+    def diagnostic_ratio(
+        self, method: str, other: str, what: str, read: Callable[[Mapping[str, Any]], float]
+    ) -> Figure:
+        """Return what `read` makes of the diagnostics of a run, divided by that of the other with its seed.
+
+        It is the mean over seeds; `read` returns NaN for diagnostics without a usable number.
+        """
+        missing = tuple(label for label in (method, other) if label not in self.runs)
+        seeds = self.common_seeds((method, other))
+        parts, wholes = (
+            [read(self.runs[label][seed].record.diagnostics) for seed in seeds] for label in (method, other)
+        )
+        ratios = np.array(parts) / np.array(wholes)
+        if not seeds or not np.isfinite(ratios).all():
+            note = "" if missing else "not in these records"
+            return Figure(what, (method, other), NO_ESTIMATE, seeds, missing, note, ".3f")
+        found = mean_of_seeds(ratios, UNBOUNDED, ratio=True)
+        return Figure(what, (method, other), found, seeds, (), "", ".3f")
+
     def share_of_preparation(self, method: str) -> Figure:
         """Return the share of a run's optimiser steps that its preparation took, mean over seeds."""
 

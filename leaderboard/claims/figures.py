@@ -44,7 +44,7 @@ def kept(evidence: Evidence, method: str, other: str) -> Figure:
     return evidence.figure(what, difference, method, other, span=(-1, 1), **rest)
 
 
-TOLD = ("replay", "tau_start", "loss_scale", "step_factor")
+TOLD = ("replay", "tau_start", "loss_scale", "orthogonal", "schedule", "step_factor")
 """Hyper-parameters that tell how a run of a label differs from the published method."""
 
 
@@ -71,7 +71,9 @@ def share_of_steps(evidence: Evidence, method: str, other: str) -> Figure:
         first, second = (np.log(np.maximum(of[label].steps, 1.0)) for label in (method, other))
         return np.exp(average(average(first - second)))
 
-    return evidence.figure(f"steps to the criterion, {method} / {other}", ratio, method, other, ratio=True)
+    what, note = f"steps to the criterion, {method} / {other}", _settings(evidence, method, other)
+    rest: dict[str, Any] = {"note": note} if note else {}
+    return evidence.figure(what, ratio, method, other, ratio=True, **rest)
 
 
 def question_drop(evidence: Evidence, method: str) -> Figure:
@@ -201,6 +203,24 @@ def drift_ratio(evidence: Evidence, method: str) -> Figure:
             return np.exp(average(np.log(part / np.where(whole > 0, whole, np.nan))))
 
     return evidence.figure(f"activation drift, {method} / sft", ratio, method, "sft", ratio=True)
+
+
+def anchor_ratio(evidence: Evidence) -> Figure:
+    """Return the distance at which AEGIS keeps a batch from its anchor, divided by that of the control.
+
+    The distance is the quantity that AEGIS acts on, on the robot's batches at the end of the first stage.
+    The control has a random direction, and sheds nearly no energy; plain fine-tuning has no anchor.
+    """
+    what = "distance of a batch to the anchor, aegis / aegis+direction=random"
+    return evidence.diagnostic_ratio("aegis", "aegis+direction=random", what, _last_distance)
+
+
+def _last_distance(diagnostics: Mapping[str, Any]) -> float:
+    """Return the last distance of a batch to the anchor in the first stage, NaN if there is none."""
+    found = diagnostics.get("1")
+    values = found.get("anchor_distance") if isinstance(found, dict) else None
+    last: Any = values[-1] if isinstance(values, list) and values else None
+    return float(last) if is_number(last) and last > 0 else math.nan
 
 
 def median_stage(evidence: Evidence, method: str) -> Figure:

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from clbench.base.entry_points import resolve
 from clbench.data.demonstrations import demonstrate
+from clbench.exchange.shown import steps_per_second
+from clbench.runs.film import frames_per_second
 from clbench.spec.language import word_id
 from clbench.spec.registry import load_scenario
 from clbench.spec.task import Task
@@ -290,3 +292,10 @@ def test_in_a_perturbed_episode_a_thing_is_heavier_and_the_body_in_motion(name: 
         pushed = [speed * drawn.start[joint % 2] for joint, speed in enumerate(body.starts)]
         np.testing.assert_allclose(after.qvel - before.qvel, pushed, rtol=1e-12, atol=1e-12)
         assert np.any(pushed)
+
+
+@pytest.mark.parametrize(("task", "rate"), [("point_mass_easy", 6.25), ("cartpole_balance", 25.0)])
+def test_data_sets_and_films_have_the_rate_of_the_body(task: str, rate: float) -> None:
+    assert 1 / dm_control_environment(task, 0).control_timestep() == pytest.approx(rate)
+    assert steps_per_second(SCENARIO.task(task)) == rate
+    assert frames_per_second(SCENARIO.task(task)) == int(rate)

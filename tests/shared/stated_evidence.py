@@ -41,6 +41,9 @@ class Stated:
     def diagnostic(self, method: str, what: str, *_: Any) -> Any:
         return self.figure(what, None, method)
 
+    def diagnostic_ratio(self, method: str, other: str, what: str, *_: Any) -> Any:
+        return self.figure(what, None, method, other)
+
     def cost(self, name: str, method: str, what: str, *_: Any) -> Any:
         return self.figure(what, None, method)
 

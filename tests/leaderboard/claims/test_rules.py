@@ -279,6 +279,36 @@ def test_what_would_change_a_rapid_loss_is_the_point_that_shows_it(bench: Bench)
     assert "sft after 50 steps of the first target" in finding.change
 
 
+def _distances(*ends: Any) -> Callable[[Record], None]:
+    """Return an edit of records: the distance of the batch to the anchor at the end, by seed."""
+
+    def edit(record: Record) -> None:
+        record.diagnostics = {"1": {"anchor_distance": [90.0, ends[record.run.seed]]}}
+
+    return edit
+
+
+def test_the_distance_to_the_anchor_is_that_of_the_same_seed_with_a_random_direction(bench: Bench) -> None:
+    bench.add("sft", drift=1.0)
+    bench.add("aegis", drift=0.9, edit=_distances(2.0, 1.1, 7.2))
+    bench.add("aegis+direction=random", edit=_distances(200.0, 100.0, 800.0))
+    finding = bench.judge("A6")
+    (near,) = (one for one in finding.controls if one.what.startswith("distance of a batch"))
+    assert near.value == pytest.approx(0.01)
+    assert finding.sentences[0].startswith("The projection acts: at the end of the first stage")
+    assert f"is 0.010 [{near.low:.3f}, {near.high:.3f}] of that with" in finding.sentences[0]
+
+
+@pytest.mark.parametrize("ends", [(250.0, 110.0, 700.0), (0.0, 1.0, 8.0), ("2", 1.0, 8.0)])
+def test_a_distance_that_is_not_certainly_smaller_or_no_number_says_nothing(
+    bench: Bench, ends: tuple[Any, ...]
+) -> None:
+    bench.add("sft")
+    bench.add("aegis", edit=_distances(*ends))
+    bench.add("aegis+direction=random", edit=_distances(200.0, 100.0, 800.0))
+    assert bench.judge("A6").sentences == ()
+
+
 def test_the_seeds_in_which_aegis_sheds_little_are_counted(bench: Bench) -> None:
     def shed(record: Record) -> None:
         record.diagnostics["1"] = {"energy_shed_mean": 0.004 + 0.05 * (record.run.seed == 2)}
