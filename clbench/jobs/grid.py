@@ -99,8 +99,8 @@ def run_missing(
         check: Job that must succeed before anything else is done; its limits hold for the runs, too.
 
     Raises:
-        InputError: A record is of another definition of its scenario, or this
-            machine cannot render what a scenario needs.
+        InputError: A record is of another definition of its scenario, or this machine cannot render what a
+            scenario needs.
     """
     sweep(records, cache_folder(), minari_folder() / "clbench")
     to_do = missing(runs, records, checkpoints)

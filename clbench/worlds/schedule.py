@@ -75,7 +75,7 @@ class Schedule:
         if stage is not None:
             self._check_stage(stage)
         if task is not None:
-            self._choose({})
+            self._choose({})  # refuses an unknown name
 
     @property
     def instruction_space(self) -> spaces.Space[Any]:
@@ -110,6 +110,8 @@ class Schedule:
     def _choose(self, options: Mapping[str, Any]) -> tuple[Task, int]:
         """Return task and stage of the next episode."""
         scenario = self._scenario
+        if "stage" in options:
+            self._check_stage(options["stage"])
         name = options.get("task", self._task)
         if name is not None:
             if not isinstance(name, str):
@@ -118,7 +120,6 @@ class Schedule:
             task = scenario.task(name)
             return task, scenario.target.index(task) + 1 if task in scenario.target else 0
         if "stage" in options:
-            self._check_stage(options["stage"])
             self._episode = (options["stage"] - self._first) * self._episodes_per_stage
         else:
             self._episode += 1
@@ -132,10 +133,9 @@ class Schedule:
         last = len(self._scenario.target)
         if not is_whole(stage) or stage not in range(self._first, last + 1):
             raise InputError(f"{self._scenario.id} has stages {self._first} to {last}, not {stage!r}.")
-        if self._stage not in (None, stage):
-            raise InputError(
-                f"This environment stays in stage {self._stage}: make another for stage {stage}."
-            )
+        if self._stage not in (None, stage) or self._task is not None:
+            home = f"in stage {self._stage}" if self._task is None else f"with the task {self._task!r}"
+            raise InputError(f"This environment stays {home}: make another for stage {stage}.")
 
 
 def is_whole(value: Any) -> bool:

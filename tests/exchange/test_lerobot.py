@@ -17,7 +17,7 @@ from clbench.base.errors import InputError, MissingPackageError
 from clbench.data.demonstrations import Demonstration, dataset_folder, read_dataset
 from clbench.exchange.lerobot import write_lerobot
 from clbench.spec.scenario import Scenario
-from clbench.testing import TOY
+from clbench.testing import TOY, ToyWorld
 from clbench.worlds.observation import observed
 
 CAMERA = "clbench.testing.toy_camera:ToyCamera"
@@ -212,16 +212,13 @@ def test_lerobot_doctor_finds_no_fault(scenario: Scenario, tmp_path: Path) -> No
     assert (report["fps"], report["total_episodes"]) == (10, 10 * len(scenario.retained + scenario.target))
 
 
-class Rateless:
-    """Makes toy worlds that do not give their steps per second, or give others."""
+class Rateless(ToyWorld):
+    """A world that does not give its steps per second."""
 
     metadata: dict[str, Any] = {}  # noqa: RUF012
 
-    def close(self) -> None:
-        pass
 
-
-class Faster(Rateless):
+class Faster(ToyWorld):
     """A world with 20 steps per second."""
 
     metadata: dict[str, Any] = {"render_fps": 20}  # noqa: RUF012

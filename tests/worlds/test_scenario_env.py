@@ -269,6 +269,8 @@ def test_one_task_is_a_known_name_and_excludes_a_stage() -> None:
         _toy(task="lefft")
     with pytest.raises(ValueError, match="stage or task, not both"):
         _toy(task="left", stage=0)
+    with pytest.raises(ValueError, match="stays with the task 'left': make another for stage 1"):
+        _toy(task="left").reset(options={"stage": 1})
 
 
 def test_a_step_after_the_end_of_an_episode_is_refused_and_not_counted() -> None:
