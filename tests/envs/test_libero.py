@@ -317,7 +317,9 @@ def test_liberos_own_renderer_has_the_back_end_that_the_user_chose(chosen: str, 
         f"import {WORLD.partition(':')[0]}; from robosuite.utils.binding_utils import GLContext; "
         "print(GLContext.__name__)"
     )
-    environment = {**os.environ, "MUJOCO_GL": chosen}
+    # a test before that drew in this process has set the platform
+    own = {name: value for name, value in os.environ.items() if name != "PYOPENGL_PLATFORM"}
+    environment = {**own, "MUJOCO_GL": chosen}
     loaded = subprocess.run(
         [sys.executable, "-c", "import mujoco"], env=environment, capture_output=True, check=False
     )
