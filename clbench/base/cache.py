@@ -126,13 +126,13 @@ def _explained(folder: Path) -> Iterator[None]:
     except CacheError:  # of another result, which `make` needs
         raise
     except (OSError, SafetensorError) as error:
-        if isinstance(error, OSError) and not _is_the_machines(error) and not _is_on_the_way(error, folder):
+        if isinstance(error, OSError) and not is_the_machines(error) and not _is_on_the_way(error, folder):
             raise
         reason = getattr(error, "strerror", None) or error
         raise CacheError(f"{folder} cannot be written: {reason}.") from error
 
 
-def _is_the_machines(error: OSError) -> bool:
+def is_the_machines(error: OSError) -> bool:
     """Return whether the machine is to blame: it has no room, or its disk or network fails."""
     return error.errno in NO_ROOM + FAILING
 
@@ -177,7 +177,7 @@ def _fault(folder: Path, key: str) -> str | None:
             return "is torn: its files are not those that were written"
     except (OSError, ValueError, KeyError, TypeError) as error:
         refused = error if isinstance(error, OSError) else error.__cause__  # of `read_json`
-        if isinstance(refused, OSError) and _is_the_machines(refused):
+        if isinstance(refused, OSError) and is_the_machines(refused):
             raise CacheError(f"{folder} cannot be read now: {refused.strerror}.") from error
         return "is torn or foreign: it has no readable manifest"
     return None

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
 
-from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError
 from clbench.data.demonstrations import Demonstration
 from clbench.spec.task import Task
 from clbench.worlds.camera import Images
+from clbench.worlds.lanes import control_rate
 from clbench.worlds.observation import observed
 from clbench.worlds.world import States
 
@@ -48,12 +47,10 @@ def steps_per_second(task: Task) -> float:
     Raises:
         InputError: The world gives no rate.
     """
-    with closing(resolve(task.world)()) as world:
-        world.reset(seed=0, options={"task": task.name})  # a world may have a rate for each task
-        rate = world.metadata.get("render_fps")
+    rate = control_rate(task)
     if rate is None:
         raise InputError(
             f"The world {task.world} of the task {task.name} does not give its steps per second, which a "
             'data set holds: add them to its class, for example metadata = {"render_fps": 25}.'
         )
-    return float(rate)
+    return rate

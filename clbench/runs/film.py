@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from clbench.base.dependencies import require
-from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError
 from clbench.base.leftovers import replacing
 from clbench.base.progress import ProgressCallback, no_progress
@@ -31,6 +30,7 @@ from clbench.policy.policy import Policy
 from clbench.runs.spec import ResolvedRun
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
+from clbench.worlds.lanes import control_rate
 from clbench.worlds.world import World, opened_worlds
 
 FORMATS = (".gif", ".mp4")
@@ -314,9 +314,7 @@ def column_of(run: ResolvedRun, stage: int, *, alone: bool) -> str:
 
 def frames_per_second(task: Task) -> int:
     """Return the speed of a task's films: that of its world, at most `FASTEST`; 25 if it has none."""
-    with closing(resolve(task.world)()) as world:
-        world.reset(seed=0, options={"task": task.name})  # a world may have a rate for each task
-        return min(int(world.metadata.get("render_fps", 25)), FASTEST)
+    return min(int(control_rate(task) or 25), FASTEST)
 
 
 @functools.cache

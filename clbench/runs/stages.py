@@ -15,7 +15,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clbench.base.cache import FAILING, NO_ROOM, CacheError, cache_folder, cached, hash_of, is_cached
+from clbench.base.cache import NO_ROOM, CacheError, cache_folder, cached, hash_of, is_cached, is_the_machines
 from clbench.base.errors import ClbenchError
 from clbench.base.lease import LeaseLostError
 from clbench.base.progress import ProgressCallback, no_progress
@@ -55,7 +55,7 @@ def machine_needed() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno not in NO_ROOM + FAILING:
+        if not is_the_machines(error):
             raise
         full = error.errno in NO_ROOM
         fault, mend = ("has no room", "make room") if full else ("failed", "mend it")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing
 
 import gymnasium
 import numpy as np
@@ -87,6 +88,14 @@ def is_perturbable(task: Task) -> bool:
     """Return whether the world of a task, or its suite's own vector world, declares itself perturbable."""
     world = resolve(task.world)
     return bool(getattr(getattr(world, "vector_world", None) or world, "perturbable", False))
+
+
+def control_rate(task: Task) -> float | None:
+    """Return the steps per second of a task in its world, None if the world does not give them."""
+    with closing(resolve(task.world)()) as world:
+        world.reset(seed=0, options={"task": task.name})  # a world may have a rate for each task
+        rate = world.metadata.get("render_fps")
+    return None if rate is None else float(rate)
 
 
 def check_perturbable(tasks: Iterable[Task]) -> None:

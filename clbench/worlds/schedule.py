@@ -112,15 +112,13 @@ class Schedule:
         scenario = self._scenario
         if "stage" in options:
             self._check_stage(options["stage"])
-        name = options.get("task", self._task)
-        if name is not None:
+            self._episode = (options["stage"] - self._first) * self._episodes_per_stage
+        elif "task" in options or self._task is not None:
+            name = options.get("task", self._task)
             if not isinstance(name, str):
-                which = 'The option "task"' if "task" in options else "task"
-                raise InputError(f"{which} must be a name, not {name!r}.")
+                raise InputError(f'The option "task" must be a name, not {name!r}.')
             task = scenario.task(name)
             return task, scenario.target.index(task) + 1 if task in scenario.target else 0
-        if "stage" in options:
-            self._episode = (options["stage"] - self._first) * self._episodes_per_stage
         else:
             self._episode += 1
         stage = min(self._first + self._episode // self._episodes_per_stage, len(scenario.target))

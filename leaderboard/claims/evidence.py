@@ -223,17 +223,12 @@ class Evidence:
 
         It is the mean over seeds; `read` returns NaN for diagnostics without a usable number.
         """
-        missing = tuple(label for label in (method, other) if label not in self.runs)
         seeds = self.common_seeds((method, other))
         parts, wholes = (
             [read(self.runs[label][seed].record.diagnostics) for seed in seeds] for label in (method, other)
         )
-        ratios = np.array(parts) / np.array(wholes)
-        if not seeds or not np.isfinite(ratios).all():
-            note = "" if missing else "not in these records"
-            return Figure(what, (method, other), NO_ESTIMATE, seeds, missing, note, ".3f")
-        found = mean_of_seeds(ratios, UNBOUNDED, ratio=True)
-        return Figure(what, (method, other), found, seeds, (), "", ".3f")
+        ratios = [part / whole for part, whole in zip(parts, wholes, strict=True)]
+        return self._of_seeds(what, (method, other), seeds, ratios, ".3f", ratio=True)
 
     def share_of_preparation(self, method: str) -> Figure:
         """Return the share of a run's optimiser steps that its preparation took, mean over seeds."""
@@ -258,12 +253,26 @@ class Evidence:
         ratio: bool = False,
     ) -> Figure:
         runs = self.runs.get(method, {})
-        missing = () if runs else (method,)
         means = [number_mean(values(run)) for run in runs.values()]
-        if not means or not np.isfinite(means).all():
+        return self._of_seeds(what, (method,), tuple(runs), means, form, span, ratio=ratio)
+
+    def _of_seeds(
+        self,
+        what: str,
+        methods: tuple[str, ...],
+        seeds: tuple[int, ...],
+        values: Sequence[float],
+        form: str,
+        span: Span = UNBOUNDED,
+        *,
+        ratio: bool = False,
+    ) -> Figure:
+        """Return the mean of one value for each seed; none without a run, or if a value is no number."""
+        if not values or not np.isfinite(values).all():
+            missing = tuple(label for label in methods if not self.runs.get(label))
             note = "" if missing else "not in these records"
-            return Figure(what, (method,), NO_ESTIMATE, tuple(runs), missing, note, form)
-        return Figure(what, (method,), mean_of_seeds(means, span, ratio=ratio), tuple(runs), (), "", form)
+            return Figure(what, methods, NO_ESTIMATE, seeds, missing, note, form)
+        return Figure(what, methods, mean_of_seeds(values, span, ratio=ratio), seeds, (), "", form)
 
     def step_time(self, method: str) -> Figure:
         """Return the time of a step of the method, divided by sft's."""

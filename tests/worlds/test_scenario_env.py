@@ -124,6 +124,7 @@ def test_options_choose_a_task_or_a_stage() -> None:
         ({"stage": 1.0}, ValueError, "has stages 0 to 2, not 1.0"),
         ({"stage": True}, ValueError, "has stages 0 to 2, not True"),
         ({"task": 3}, ValueError, 'The option "task" must be a name, not 3'),
+        ({"task": None}, ValueError, 'The option "task" must be a name, not None'),
         ({"task": "left", "stage": 99}, ValueError, "not both"),
         ({"goal": 3}, ValueError, "Options of reset are"),
     ],
