@@ -4,14 +4,17 @@ BIN := .venv/bin
 SCENARIO := clbench/Fetch-v1
 QUICK := build/quick
 
-.PHONY: help leaderboard tuning records ladder controls docs site benchmark test test-long test-slow libero-test check wheel-test clean
+.PHONY: help leaderboard tuning records ladder controls docs site benchmark test test-long test-slow libero-test check style types committed wheel-test clean
 
 define HELP
 make leaderboard  install, run two methods with one seed, and show a table, in minutes
 make test         most of the tests, in minutes
 make test-long    the tests that take a second and more, many of them whole runs
 make test-slow    the tests that take minutes each
-make check        format, lint, types, committed pages and definitions, the page in a browser
+make check        the next three, side by side with -j3
+make style        format and lint
+make types        types
+make committed    whether committed pages and definitions are those of the records and the code; the page in a browser
 make libero-test  install LIBERO (340 MB), and compare our world with it
 make wheel-test   build the wheel, and test it outside the clone
 make site         the documentation as a site: build/site/index.html
@@ -154,15 +157,19 @@ libero-test: .venv/installed-libero
 	$(BIN)/pytest tests/envs/test_libero.py tests/envs/test_libero_physics.py tests/envs/test_libero_scenario.py
 	$(BIN)/pytest tests/envs/test_every_scenario.py -k Libero
 
-# Besides style and types: whether the committed board and pages are those of the committed records, whether every scenario
-# is what its definition says, and the page in a browser.
+check: style types committed
+style: .venv/installed-dev
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+types: .venv/installed-dev
+	$(BIN)/mypy
+
+# Whether the committed board and pages are those of the committed records, whether every scenario is what its definition
+# says, and the page in a browser.
 CHECKED := tests/leaderboard/test_records.py tests/evaluation/test_definition.py \
 	tests/scoring/test_statistics_page.py tests/base/test_source.py \
 	$(addprefix tests/leaderboard/views/page/test_,in_browser.py on_a_phone.py published_page.py ways.py)
-check: .venv/installed-dev
-	$(BIN)/ruff format --check .
-	$(BIN)/ruff check .
-	$(BIN)/mypy
+committed: .venv/installed-dev
 	$(BIN)/pytest -m slow $(CHECKED)
 
 # Tests of the built wheel outside the checkout, where it could differ from the checkout: its files, the parts that are

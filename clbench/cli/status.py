@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args
 
 from cyclopts import Parameter
 from rich.console import Console
@@ -14,6 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from clbench.base.errors import InputError
+from clbench.base.lease import Lease, Owner, Report, lease_path
 from clbench.base.text import clock_time, counted, listed, print_plain, printable, shortened
 from clbench.cli.arguments import (
     AsJson,
@@ -30,7 +31,7 @@ from clbench.cli.arguments import (
 )
 from clbench.cli.runs import requested
 from clbench.records.paths import RECORDS
-from clbench.records.status import RunState, State, found_runs, run_state, seconds_left
+from clbench.records.reader import RecordError, UnreadableRecordError, check_home, read_record
 from clbench.spec.identifiers import check_known
 from clbench.spec.policies import DEFAULT_POLICY, SMALL, policy_name
 from clbench.spec.protocol import DEFAULT_SEEDS
@@ -49,7 +50,37 @@ NOT_GIVEN: Mapping[str, object] = {
 }
 """Values of the options that choose among the runs of a scenario, where nobody gave them."""
 
-STATES: tuple[State, ...] = ("done", "running", "failed", "damaged", "unreadable", "to do")
+State = Literal["done", "running", "failed", "damaged", "unreadable", "to do"]
+
+STATES: tuple[State, ...] = get_args(State)
+
+OTHER_SETTINGS = "the record there has other settings, budget or code: `clbench run` does it again"
+"""Reason of a run that is to do although its place has a record."""
+
+
+class RunState(NamedTuple):
+    """The state of one run."""
+
+    path: Path
+    """Path of its record."""
+    state: State
+    """A run is damaged if its record is torn or contradicts itself; `clbench run` does it again. It is
+    unreadable if its record may be sound: it is of a newer clbench, or the file system refuses it."""
+    owner: Owner | None = None
+    """Process that does the run."""
+    progress: Report | None = None
+    """How far that process is, None if it has not told yet."""
+    seconds: float | None = None
+    """Seconds that a run with a record took."""
+    reason: str | None = None
+    """Why a run failed, or why its record cannot be read."""
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Seconds that a running run needs, None if they are unknown."""
+        if self.progress is None or not 0 < self.progress.share <= 1:
+            return None
+        return self.progress.seconds * (1 / self.progress.share - 1)
 
 
 def status(
@@ -86,8 +117,6 @@ def status(
             method's defaults, as --set.name value.
         as_json: Print a JSON list with an object for each run, and no table.
     """
-    from clbench.scoring.scores import Scores
-
     add_cwd_to_path()
     with checked_input():
         if scenarios is None:
@@ -101,7 +130,7 @@ def status(
             paths = found_runs(records)
             if not paths:
                 raise InputError(f"There are no runs in {records}: `clbench run` makes them.")
-            states = [run_state(path, Scores.from_record) for path in paths]
+            states = [run_state(path) for path in paths]
         else:
             check_known(items_of("SCENARIOS", scenarios), methods)
             from clbench.runs.spec import RunSpec
@@ -109,7 +138,7 @@ def status(
             name = policy_name(policy, policy_size)
             spec = RunSpec("", "", first_seed, changes or {}, order=order, policy=name)
             runs = requested(scenarios, methods, every, seeds, spec, records)
-            states = [_state_of(run, records) for run in runs]
+            states = [run_state(run.path(records), run) for run in runs]
     if as_json:
         print_json([_values(state, records) for state in states])
         return
@@ -122,16 +151,71 @@ def status(
     console.print(_summary(states), highlight=False)
 
 
-def _state_of(run: ResolvedRun, records: Path) -> RunState:
-    """Return the state of a run that was asked for: a record of other settings is not its record."""
-    from clbench.jobs.recorded import changed_code, has_settings_of
+def run_state(path: Path, run: ResolvedRun | None = None) -> RunState:
+    """Return the state of the run whose record has the path.
+
+    Args:
+        path: Path of the record.
+        run: The run that was asked for: a record of other settings is not its record. If None, any record is.
+    """
     from clbench.scoring.scores import Scores
 
-    def is_wanted(record: Record) -> bool:
-        here = replace(record.run, device=run.info.device)  # the device is not asked for
-        return has_settings_of(replace(record, run=here), run) and not changed_code(record, run)
+    lease = Lease(path)
+    owner = lease.owner
+    if owner is not None:
+        return RunState(path, "running", owner, lease.progress)
+    if not path.exists():
+        return RunState(path, "to do")
+    try:
+        record = read_record(path)
+        check_home(record.run, path)
+        if record.error is None:
+            Scores.from_record(record)
+            if run is not None and not _is_of(record, run):
+                return RunState(path, "to do", reason=OTHER_SETTINGS)
+    except UnreadableRecordError as error:
+        return RunState(path, "unreadable", reason=str(error))
+    except RecordError as error:
+        return RunState(path, "damaged", reason=str(error))
+    seconds = record.timing.get("seconds")
+    if seconds is not None and not isinstance(seconds, int | float):
+        return RunState(path, "damaged", reason=f"timing: seconds must be a number, not {seconds!r}")
+    if record.error is not None:
+        return RunState(path, "failed", seconds=seconds, reason=record.failure)
+    return RunState(path, "done", seconds=seconds)
 
-    return run_state(run.path(records), Scores.from_record, is_wanted)
+
+def _is_of(record: Record, run: ResolvedRun) -> bool:
+    from clbench.jobs.recorded import changed_code, has_settings_of
+
+    here = replace(record.run, device=run.info.device)  # the device is not asked for
+    return has_settings_of(replace(record, run=here), run) and not changed_code(record, run)
+
+
+def found_runs(records: Path) -> list[Path]:
+    """Return the paths of the records below a folder, and of those that are being made."""
+    made = set(records.glob("*/*/seed-*.json"))
+    running = {
+        path.with_name(path.name.removeprefix(".").removesuffix(".lease"))
+        for path in records.glob(f"*/*/{lease_path(Path('seed-*.json')).name}")
+    }
+    return sorted(made | running)
+
+
+def seconds_left(states: Iterable[RunState]) -> float | None:
+    """Return the seconds until all runs are done by the processes that are at work, None if unknown.
+
+    A run that is to do takes the mean of the runs that are done.
+    """
+    states = list(states)
+    running = [state for state in states if state.state == "running"]
+    known = [state.seconds for state in states if state.state == "done" and state.seconds is not None]
+    open_runs = sum(state.state in ("to do", "damaged") for state in states)
+    left = [state.seconds_left for state in running]
+    if not running or (open_runs and not known) or None in left:
+        return None
+    mean = sum(known) / len(known) if known else 0.0
+    return (sum(value for value in left if value is not None) + open_runs * mean) / len(running)
 
 
 def _table(states: Sequence[RunState]) -> Table:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import itertools
 import os
 from pathlib import Path
 
 from clbench.base.errors import InputError
+from clbench.records.paths import free_name
 from clbench.records.pinned import other_parts
 from clbench.records.reader import RecordError, UnreadableRecordError, read_record
 from clbench.records.record import Record
@@ -43,8 +43,14 @@ def has_record(run: ResolvedRun, records: Path) -> bool:
 
 
 def has_settings_of(record: Record, run: ResolvedRun) -> bool:
-    """Return whether a record has the settings, the budget and the device of a run; it may be perturbed."""
-    found = record.run if run.spec.perturb else dataclasses.replace(record.run, perturb=False)
+    """Return whether a record has the settings, the budget and the device of a run; it may be perturbed.
+
+    The board's rule holds: a setting that an older record lacks was added later, with a default that changes
+    nothing.
+    """
+    settings = {**run.defaults, **record.run.settings}
+    perturb = record.run.perturb and run.spec.perturb
+    found = dataclasses.replace(record.run, settings=settings, perturb=perturb)
     return (found, record.scenario) == (run.info, run.scenario_info)
 
 
@@ -82,8 +88,7 @@ def set_aside(run: ResolvedRun, records: Path) -> str | None:
         if record.status != "success" or not changed:
             return None
         fault, ending = f"the code of {' and '.join(changed)} has changed since", "old"
-    names = (path.with_name(f"{path.name}.{ending}{number or ''}") for number in itertools.count())
-    aside = next(one for one in names if not os.path.lexists(one))
+    aside = free_name(path, ending)
     with contextlib.suppress(FileNotFoundError):  # another command was faster
         path.replace(aside)
     return f"{path}: {fault}. It is renamed to {aside.name}, and the run is repeated."

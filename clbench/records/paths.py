@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -95,3 +96,14 @@ def record_path(
 def stage_folder(root: Path, number: int) -> Path:
     """Return the folder below `root` of the policy after a stage; 0 is before the first target."""
     return root / f"stage-{number}"
+
+
+def free_name(path: Path, ending: str) -> Path:
+    """Return the path for a record that is set aside, next to its own: "seed-0.json.old", or with a number.
+
+    Args:
+        path: Path of the record.
+        ending: What follows its name. No reader of records looks for such names.
+    """
+    names = (path.with_name(f"{path.name}.{ending}{number or ''}") for number in itertools.count())
+    return next(name for name in names if not os.path.lexists(name))

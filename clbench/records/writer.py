@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from clbench.base.errors import InputError
 from clbench.base.leftovers import replacing
 from clbench.base.strict_json import LONGEST_TEXT, check_json
 from clbench.records.content import content_hash
+from clbench.records.paths import free_name
 from clbench.records.reader import RecordError, UnreadableRecordError, read_record
 from clbench.records.record import SCHEMA, Record
 
@@ -45,24 +47,36 @@ def write_record(record: Record, path: Path) -> None:
 
 
 def write_result(record: Record, path: Path) -> None:
-    """Write the record of a run, but leave that of a run that succeeded, or may have, if this one failed.
+    """Write the record of a run, and lose none of a run that succeeded, or may have.
+
+    If this run failed, such a record stays in its place. If it is of other settings, another budget or
+    another device, its file is kept next to the new one, with the ending ".old".
 
     Raises:
         InputError: As for `write_record`.
     """
-    if record.status == "failed" and _may_have_succeeded(path):
+    try:
+        before = read_record(path)
+        is_kept, is_other = before.status == "success", not _holds(record, before)
+    except UnreadableRecordError:
+        is_kept = is_other = True
+    except RecordError:
+        is_kept = is_other = False
+    if is_kept and record.status == "failed":
         LOG.warning("%s stays: it is of a run that succeeded, or may be, and the new one failed.", path)
         return
+    if is_kept and is_other:
+        aside = free_name(path, "old")
+        shutil.copyfile(path, aside)  # and not renamed: a reader finds a record there at any time
+        LOG.warning("%s was of other settings, another budget or device: it is now %s.", path, aside.name)
     write_record(record, path)
 
 
-def _may_have_succeeded(path: Path) -> bool:
-    try:
-        return read_record(path).status == "success"
-    except UnreadableRecordError:
-        return True
-    except RecordError:
-        return False
+def _holds(record: Record, before: Record) -> bool:
+    """Return whether a record is of the same run as another, or of that run with perturbed episodes too."""
+    perturb = before.run.perturb or record.run.perturb
+    was = (dataclasses.replace(before.run, perturb=perturb), before.scenario)
+    return was == (record.run, record.scenario)
 
 
 def record_text(record: Record) -> str:

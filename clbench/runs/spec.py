@@ -141,11 +141,15 @@ class ResolvedRun:
         return self.scenario_info.protocol(self.spec.split, self.spec.perturb)
 
     @cached_property
+    def defaults(self) -> Mapping[str, Any]:
+        """The method's own hyper-parameters, neither tuned nor changed, as a record holds them."""
+        return _settings_of(self.method())
+
+    @cached_property
     def info(self) -> RunInfo:
         """`Record.run`. Two runs with equal `info` and `scenario_info` are the same run."""
         spec, method = self.spec, self.new_method()
-        values = dataclasses.asdict(method)
-        settings = {name: _as_json(value) for name, value in values.items()}
+        settings = _settings_of(method)
         return RunInfo(
             scenario=self.scenario.id,
             method=spec.method,
@@ -182,6 +186,10 @@ def describe_scenario(scenario: Scenario) -> ScenarioInfo:
     retained, target, held_out = ([task.name for task in group] for group in groups)
     steps, budget = list(scenario.budget.evaluation_steps), dataclasses.asdict(scenario.budget)
     return ScenarioInfo(scenario.id, retained, target, held_out, steps, budget, scenario.balanced)
+
+
+def _settings_of(method: Method) -> dict[str, Any]:
+    return {name: _as_json(value) for name, value in dataclasses.asdict(method).items()}
 
 
 def _as_json(value: Any) -> Any:

@@ -87,6 +87,7 @@ def test_an_owner_learns_that_it_lost_its_lease(tmp_path: Path, monkeypatch: pyt
     lease.release()
 
 
+@pytest.mark.long
 def test_an_owner_that_slept_learns_at_once_that_another_process_took_over(tmp_path: Path) -> None:
     lease, path = Lease(tmp_path / "x"), tmp_path / "x"
     assert lease.take()

@@ -31,6 +31,7 @@ def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.rglob("*")] == ["below"]
 
 
+@pytest.mark.long
 def test_a_lease_goes_with_its_report_once_its_process_is_dead(tmp_path: Path) -> None:
     code = "import os, sys; from pathlib import Path; from clbench.base.lease import Lease; "
     code += "lease = Lease(Path(sys.argv[1])); lease.take(); lease.report(0.5); os._exit(0)"
@@ -70,6 +71,7 @@ def test_a_folder_that_a_living_process_of_this_machine_makes_stays_without_its_
     assert sweep(tmp_path) == 1
 
 
+@pytest.mark.long
 def test_an_unfinished_file_goes_at_once_if_its_process_is_dead(tmp_path: Path) -> None:
     code = "import sys; from pathlib import Path; from clbench.base.leftovers import unfinished; "
     code += "unfinished(Path(sys.argv[1])).touch()"

@@ -285,12 +285,14 @@ def test_the_order_in_which_packages_are_named_does_not_matter() -> None:
     assert source_hash("clbench.policy", "clbench.spec") == source_hash("clbench.spec", "clbench.policy")
 
 
+@pytest.mark.long
 def test_a_class_typed_at_a_prompt_has_a_hash() -> None:
     code = "from clbench.base.source import source_hash; print(len(source_hash('__main__')))"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "16"
 
 
+@pytest.mark.long
 def test_a_script_on_standard_input_has_no_source() -> None:
     code = "from clbench.base.source import has_source; print(has_source('__main__'))"
     command = [sys.executable, "-"]
@@ -324,6 +326,7 @@ def test_the_hash_of_a_typed_class_follows_its_code_and_values_and_not_its_place
         assert hashed(CLASS.format(**usual | change)) != before
 
 
+@pytest.mark.long
 def test_the_hash_of_a_typed_class_is_the_same_in_every_process() -> None:
     text = CLASS.format(number=1, name="three", size=4)
     code = f"from clbench.base.source import class_hash\n{text}\nprint(class_hash(Some))"

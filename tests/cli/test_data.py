@@ -106,6 +106,7 @@ def test_a_scenario_of_the_working_folder_is_found(
     assert "left: retained, 10 episodes" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_demonstrations_are_exported_after_those_that_are_missing_are_collected(
     empty_caches: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

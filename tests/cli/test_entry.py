@@ -89,6 +89,7 @@ def test_ctrl_c_at_any_moment_ends_the_command(number: int) -> None:
     assert "Exception ignored" not in err
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("function", ["command", "converted", "late"])
 def test_ctrl_c_is_neither_dropped_nor_turned_into_another_error(function: str) -> None:
     process = _start(STUBBORN.format(function))
@@ -100,6 +101,7 @@ def test_ctrl_c_is_neither_dropped_nor_turned_into_another_error(function: str) 
     assert out == ("done\n" if function == "late" else "")
 
 
+@pytest.mark.long
 def test_a_process_that_ignores_ctrl_c_still_does_so_as_a_command(tmp_path: Path) -> None:
     ignoring = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
     look = "import sys; sys.argv[0] = 'clbench'; import clbench.cli.entry, clbench.cli.main"
@@ -108,6 +110,7 @@ def test_a_process_that_ignores_ctrl_c_still_does_so_as_a_command(tmp_path: Path
     assert _exit_code(process)[:2] == (0, "True\n")
 
 
+@pytest.mark.long
 def test_a_program_that_uses_the_package_keeps_its_own_handling() -> None:
     process = _start(
         "import clbench, signal; print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)"
@@ -115,6 +118,7 @@ def test_a_program_that_uses_the_package_keeps_its_own_handling() -> None:
     assert _exit_code(process)[:2] == (0, "True\n")
 
 
+@pytest.mark.long
 def test_a_bug_shows_its_traceback() -> None:
     bug = "import clbench.cli.main, clbench.cli.entry\ndef main():\n    {}['key']\n"
     process = _start(f"{bug}clbench.cli.main.main = main\nclbench.cli.entry.main()")
@@ -123,6 +127,7 @@ def test_a_bug_shows_its_traceback() -> None:
     assert err.rstrip().endswith("KeyError: 'key'")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("output", "code", "error"),
     [
@@ -137,6 +142,7 @@ def test_output_that_goes_nowhere_shows_no_traceback(output: str, code: int, err
     assert (found.returncode, found.stderr) == (code, error)
 
 
+@pytest.mark.long
 def test_a_reader_that_leaves_ends_the_command_without_a_traceback() -> None:
     program = f"import clbench.cli.main as m, sys; m.main = lambda: print('x' * 10**6); {RUN}"
     process = subprocess.Popen(
@@ -150,6 +156,7 @@ def test_a_reader_that_leaves_ends_the_command_without_a_traceback() -> None:
     assert process.wait() == 1
 
 
+@pytest.mark.long
 def test_no_text_in_the_log_controls_the_terminal() -> None:
     log = "logging.getLogger('clbench').warning('%s', '[red]x\\x1b[2J')"
     program = f"import clbench.cli.main as m, logging; m.app = lambda: {log}; m.main()"
@@ -158,6 +165,7 @@ def test_no_text_in_the_log_controls_the_terminal() -> None:
     assert "\x1b" not in found.stderr
 
 
+@pytest.mark.long
 def test_a_terminal_without_a_sign_gets_another_and_no_traceback() -> None:
     program = f"import clbench.cli.main as m, sys; m.main = lambda: print('0.5 \\u00b1 0.1'); {RUN}"
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}

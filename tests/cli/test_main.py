@@ -30,6 +30,7 @@ def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.Complete
     return subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=600, check=False)
 
 
+@pytest.mark.long
 def test_names_are_checked_before_pytorch_is_imported() -> None:
     commands = [
         ["run", "clbench/Fetch-v1", "sfft"],
@@ -51,6 +52,7 @@ for command in {commands}:
     assert done.stderr.count("Did you mean") == len(commands)
 
 
+@pytest.mark.long
 def test_a_wrong_name_ends_the_process_without_a_traceback(tmp_path: Path) -> None:
     result = _clbench("run", "clbench/Fecth-v1", "sft", folder=tmp_path)
     assert (result.returncode, result.stdout) == (2, "")
@@ -58,6 +60,7 @@ def test_a_wrong_name_ends_the_process_without_a_traceback(tmp_path: Path) -> No
     assert "Traceback" not in result.stderr
 
 
+@pytest.mark.long
 def test_the_shards_of_a_command_do_each_of_its_runs_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -124,6 +127,7 @@ def test_a_folder_with_markup_in_its_name_is_shown_as_it_is(
     assert ended.value.code == 1
 
 
+@pytest.mark.long
 def test_help_shows_every_command_with_its_summary_and_imports_none() -> None:
     program = "import sys; from clbench.cli.main import app; app('--help', result_action='return_value')"
     command = [sys.executable, "-c", f"{program}; print({{'clbench.cli.runs', 'torch'}} & set(sys.modules))"]
@@ -136,6 +140,7 @@ def test_help_shows_every_command_with_its_summary_and_imports_none() -> None:
     assert lines[-1] == "set()"
 
 
+@pytest.mark.long
 def test_the_first_line_of_a_commands_help_names_its_arguments(capsys: pytest.CaptureFixture[str]) -> None:
     for name in PLACES:
         app([name, "--help"], result_action="return_value")
@@ -202,6 +207,7 @@ def test_lists_metrics_and_the_machine_come_as_json_too(capsys: pytest.CaptureFi
     assert "torch" in machine["packages"]
 
 
+@pytest.mark.long
 def test_doctor_says_what_to_fix_if_something_needed_is_wrong(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -215,6 +221,7 @@ def test_doctor_says_what_to_fix_if_something_needed_is_wrong(
     assert last == "pip install 'scipy<2,>=1.17'"
 
 
+@pytest.mark.long
 def test_doctor_shows_versions_and_rendering(capsys: pytest.CaptureFixture[str]) -> None:
     app(["doctor"], result_action="return_value")
     shown = capsys.readouterr().out
@@ -245,6 +252,7 @@ def test_a_dry_run_says_what_would_be_done_and_does_nothing(
     assert not any(path.is_file() for path in empty_caches.rglob("*"))
 
 
+@pytest.mark.long
 def test_a_dry_run_on_a_cluster_tells_the_time_of_one_core_and_starts_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

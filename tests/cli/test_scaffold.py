@@ -73,6 +73,7 @@ def fresh_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[st
     sys.modules.pop("fresh_policy", None)
 
 
+@pytest.mark.long
 def test_a_fresh_policy_keeps_the_contract(fresh_policy: str) -> None:
     check_policy(fresh_policy)
 

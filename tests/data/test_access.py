@@ -163,6 +163,7 @@ def _methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(tmp_path)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("method", "message"),
     [

@@ -103,6 +103,7 @@ def test_a_torn_dataset_is_named_and_made_again(empty_caches: Path, caplog: pyte
     assert f"{folder} is torn" in caplog.text
 
 
+@pytest.mark.long
 def test_every_kept_episode_succeeds_and_about_half_are_noisy() -> None:
     episodes = collect(load_scenario("clbench/Fetch-v1").task("press"), Budget(demonstrations=20))
     assert len(episodes) == 20

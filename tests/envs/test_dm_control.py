@@ -72,6 +72,7 @@ def test_the_scenario_is_built_of_three_bodies_and_has_tasks_enough() -> None:
     assert len(OURS) == 4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("task", OURS)
 def test_states_and_rewards_are_dm_controls_bit_for_bit(task: str) -> None:
     generator = np.random.default_rng(1)
@@ -87,6 +88,7 @@ def test_states_and_rewards_are_dm_controls_bit_for_bit(task: str) -> None:
         assert rewards == [step.reward for step in steps[1:]]
 
 
+@pytest.mark.long
 def test_lanes_of_any_bodies_in_any_company_give_the_plain_worlds_bits() -> None:
     generator = np.random.default_rng(2)
     actions = generator.uniform(-1, 1, (len(NAMES), HORIZON, state.ACTION_SIZE)).astype(np.float32)
@@ -116,6 +118,7 @@ def test_a_body_that_does_not_fit_is_refused_and_never_cut() -> None:
         state.padded("point_mass", np.zeros(9))
 
 
+@pytest.mark.long
 def test_every_number_of_a_body_is_in_the_state_and_the_rest_is_masked() -> None:
     for task in SCENARIO.retained:
         body = RULES[task.name].body

@@ -114,6 +114,7 @@ def test_steps_that_are_not_whole_segments_are_refused(steps: int) -> None:
         tiny(steps=steps)
 
 
+@pytest.mark.long
 def test_training_without_the_extra_names_the_extra_to_install(tmp_path: Path) -> None:
     hide = "import sys; sys.modules['stable_baselines3'] = None; from importlib.util import find_spec"
     program = (
@@ -130,6 +131,7 @@ def test_training_without_the_extra_names_the_extra_to_install(tmp_path: Path) -
     )
 
 
+@pytest.mark.long
 def test_the_written_out_gradient_step_equals_stable_baselines3() -> None:
     trainers = []
     for kind in (SAC, sac.WrittenOutSAC):

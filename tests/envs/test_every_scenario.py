@@ -108,6 +108,7 @@ def run(program: str) -> None:
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
+@pytest.mark.long
 def test_the_data_of_all_scenarios_load_no_simulator() -> None:
     run(
         "import clbench.spec.task, sys\n"

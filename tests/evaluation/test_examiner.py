@@ -34,6 +34,7 @@ class Enlarging(Method):
                     weight.mul_(self.factor)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("factor", [1e5, 1e18])  # hidden states beyond what a reader takes, and infinite ones
 def test_a_policy_whose_hidden_states_overflow_has_no_drift_and_a_record_that_can_be_read(
     factor: float, tmp_path: Path

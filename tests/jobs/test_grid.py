@@ -149,6 +149,7 @@ def test_a_class_inside_a_function_is_refused(tmp_path: Path) -> None:
         clbench.run(TOY, Hidden, records=tmp_path)
 
 
+@pytest.mark.long
 def test_a_run_of_another_command_that_kept_no_policies_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -114,6 +114,7 @@ def _damaged() -> bool:
     raise InputError("the record cannot be read")
 
 
+@pytest.mark.long
 def test_a_job_that_failed_elsewhere_or_cannot_be_judged_does_not_start_and_stops_no_other(
     tmp_path: Path, bars: Bars
 ) -> None:

@@ -19,6 +19,7 @@ from clbench.base.entry_points import resolve
 load = resolve("clbench:load_board")
 
 
+@pytest.mark.long
 def test_showing_twice_changes_no_byte_and_writes_no_file_again(
     four_methods: Path, shown_with_page: Callable[[], tuple[str, str]]
 ) -> None:
@@ -33,6 +34,7 @@ def test_showing_twice_changes_no_byte_and_writes_no_file_again(
     assert sorted(os.listdir(four_methods.parent / "site")) == made
 
 
+@pytest.mark.long
 def test_the_published_rows_stand_beside_ones_own(
     four_methods: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -146,6 +148,7 @@ def test_a_board_whose_reader_leaves_is_written_whole(
     assert "replay" in (site / "leaderboard.csv").read_text(encoding="utf-8")
 
 
+@pytest.mark.long
 def test_a_picture_of_a_former_board_is_removed_and_no_other_file(
     four_methods: Path, shown: Callable[[], tuple[str, str]]
 ) -> None:
@@ -162,6 +165,7 @@ def test_a_picture_of_a_former_board_is_removed_and_no_other_file(
     assert four_methods.is_dir()
 
 
+@pytest.mark.long
 def test_what_a_killed_command_left_beside_the_board_is_removed(
     four_methods: Path, shown: Callable[[], tuple[str, str]]
 ) -> None:
@@ -191,6 +195,7 @@ def test_a_folder_without_rows_lists_why_and_replaces_no_board(
     assert "retention_low" in load(tmp_path / "records")
 
 
+@pytest.mark.long
 def test_a_full_disk_leaves_every_file_of_the_board_as_it_was(
     four_methods: Path,
     shown: Callable[[], tuple[str, str]],

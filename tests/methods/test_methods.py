@@ -188,6 +188,7 @@ def short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., 
     return lambda method, **changes: execute(RunSpec(TOY, method, 0, changes), tmp_path)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "preparing", "adapting"),
     [
@@ -222,6 +223,7 @@ def test_a_run_records_its_uses_and_costs_and_has_every_metric(
     assert ((record.costs.parameters_added or 0) > 0) == (name == "lora")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("declared", ["never", "prepare", "throughout"])
 @pytest.mark.parametrize("kind", ["demonstrations", "questions"])
 def test_prior_data_can_be_touched_in_the_hooks_that_are_declared_and_in_no_other(

@@ -46,6 +46,7 @@ def test_the_definitions_are_the_metrics_that_a_success_matrix_allows() -> None:
     assert {one.family for one in DEFINITIONS.values()} == set(FAMILIES)
 
 
+@pytest.mark.long
 def test_a_metric_has_no_value_exactly_if_a_cell_that_it_needs_is_missing() -> None:
     layout = layout_of([f"task {n}" for n in range(1, 6)], ("task 1",), None, ("task 5",))
     whole: dict[str, ArrayLike] = {"": MATRIX, "joint": JOINT, "sft": JOINT}

@@ -14,10 +14,10 @@ from agents import ID, LEARNED, Knowing, stage_env
 
 import clbench
 from clbench.base.errors import InputError
+from clbench.cli.status import found_runs
 from clbench.evaluation.definition import definition
 from clbench.records.reader import read_record
 from clbench.records.record import Costs
-from clbench.records.status import found_runs
 from clbench.runs.agents import next_stage
 from clbench.runs.spec import describe_scenario
 
@@ -33,6 +33,7 @@ def test_stages_are_evaluated_once_and_in_order(evaluate: Callable[..., Any]) ->
         evaluate(Knowing(), stage_env(2), settings={"speed": 4})
 
 
+@pytest.mark.long
 def test_a_finished_record_is_never_edited(evaluate: Callable[..., Any]) -> None:
     for stage in range(3):
         evaluate(Knowing(), stage_env(stage))
@@ -110,6 +111,7 @@ def test_stages_of_another_scenario_or_simulator_are_refused_with_the_reason(
     assert next_stage(ID, method="me/knows", records=tmp_path / "records") == 1
 
 
+@pytest.mark.long
 def test_evaluating_stage_0_again_starts_over(
     evaluate: Callable[..., Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -199,6 +201,7 @@ clbench.evaluate_agent(lambda _: [0, 0], env, method="me/knows", records="record
 """
 
 
+@pytest.mark.long
 def test_a_program_that_was_refused_a_stage_does_not_keep_the_run(
     evaluate: Callable[..., Any], empty_caches: Path
 ) -> None:

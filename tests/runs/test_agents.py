@@ -31,6 +31,7 @@ class Looking:
         return np.zeros(2), None
 
 
+@pytest.mark.long
 def test_an_agent_observes_what_the_space_of_its_environment_declares(evaluate: Callable[..., Any]) -> None:
     env = gymnasium.make("clbench.testing.seen_toy:clbench/SeenToy-v0", stage=0)
     agent = Looking()
@@ -201,6 +202,7 @@ def test_an_agent_that_returns_nan_fails_its_episodes(evaluate: Callable[..., An
     assert set(record.episodes["length"]) == {12}
 
 
+@pytest.mark.long
 def test_random_draws_of_an_agent_leave_no_trace_and_repeat_themselves(evaluate: Callable[..., Any]) -> None:
     agent = lambda _: np.random.uniform(-1, 1, 2)  # noqa: E731, NPY002 - as agents of other libraries draw
     np.random.seed(3)  # noqa: NPY002
@@ -211,6 +213,7 @@ def test_random_draws_of_an_agent_leave_no_trace_and_repeat_themselves(evaluate:
     assert evaluate(agent, stage_env(0)).episodes == one
 
 
+@pytest.mark.long
 def test_steps_taken_elsewhere_are_recorded_if_given_and_missing_if_unknown(
     evaluate: Callable[..., Any],
 ) -> None:

@@ -50,6 +50,7 @@ def test_agents_of_stable_baselines3_act_on_batches_by_themselves(
     assert {shape[0] for shape in shapes} == {40}
 
 
+@pytest.mark.long
 def test_environments_side_by_side_tell_their_stage_steps_and_seconds(evaluate: Callable[..., Any]) -> None:
     envs = make_vec_env(ID, n_envs=3, seed=0, env_kwargs={"instruction": "tokens", "stage": 0})
     agent = ppo(envs)

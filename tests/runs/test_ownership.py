@@ -21,7 +21,7 @@ from clbench.base import lease as leases
 from clbench.base.cache import CacheError, cache_folder
 from clbench.base.entry_points import resolve
 from clbench.base.lease import LeaseLostError
-from clbench.jobs.recorded import has_record, set_aside
+from clbench.jobs.recorded import has_record, has_settings_of, set_aside
 from clbench.learning.method import Method
 from clbench.policy.policy import Policy
 from clbench.records.reader import UnreadableRecordError, read_record
@@ -286,6 +286,39 @@ def test_a_record_of_a_newer_clbench_stays_where_it_is(
     assert failed.status == "failed"
     write_result(failed, path)
     assert path.read_bytes() == newer
+
+
+def test_a_record_of_other_settings_is_kept_next_to_the_new_one(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    spec = RunSpec(TINY.id, "frozen", seed=0, targets=1)
+    path, old = spec.path(tmp_path), spec.path(tmp_path).with_name("seed-0.json.old")
+    record = execute(spec, tmp_path)
+    perturbed = dataclasses.replace(record, run=dataclasses.replace(record.run, perturb=True))
+    write_result(perturbed, path)  # it holds all episodes of the first one
+    assert read_record(path).run.perturb
+    assert not old.exists()
+    on_a_gpu = dataclasses.replace(record, run=dataclasses.replace(record.run, device="cuda"))
+    before = path.read_bytes()
+    write_result(on_a_gpu, path)
+    assert read_record(path).run.device == "cuda"
+    assert old.read_bytes() == before
+    assert "it is now seed-0.json.old" in caplog.text
+    write_result(record, path)
+    assert read_record(path.with_name("seed-0.json.old")).run.perturb
+    assert path.with_name("seed-0.json.old1").exists()
+
+
+def test_a_setting_that_a_record_lacks_was_added_later(tmp_path: Path) -> None:
+    spec = RunSpec(TINY.id, "frozen", seed=0, targets=1)
+    record = execute(spec, tmp_path)
+    settings = {name: value for name, value in record.run.settings.items() if name != "step_factor"}
+    assert len(settings) < len(record.run.settings)
+    older = dataclasses.replace(record, run=dataclasses.replace(record.run, settings=settings))
+    write_record(older, spec.path(tmp_path))
+    assert has_record(spec.resolve(), tmp_path)
+    changed = dataclasses.replace(spec, changes={"step_factor": 0.5}).resolve()
+    assert not has_settings_of(older, changed)
 
 
 def test_records_that_are_set_aside_one_after_the_other_all_stay(tmp_path: Path) -> None:

@@ -132,6 +132,7 @@ def test_the_skill_that_is_relearned_is_the_one_with_the_fewest_successes(
     assert checked == [lost]
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("one_thread")
 def test_a_skill_is_relearned_by_plain_steps_of_the_scenarios_size_on_draws_of_the_runs_seed() -> None:
     trainer = Trainer.open(EAGER, lambda: load_method("sft")(step_factor=0.1), 1, "cpu")
@@ -193,6 +194,7 @@ def test_adapters_are_relearned_with_all_that_they_adapt(tmp_path: Path) -> None
         assert ("lora_" in name) or torch.equal(before, after), name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["sft", "lora"])
 def test_what_a_policy_freezes_stays_frozen_in_relearning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str

@@ -123,6 +123,7 @@ def test_policies_of_the_same_run_with_another_evaluation_count(kept: Path) -> N
     assert not has_stages(dataclasses.replace(SPEC, changes={"rank": 4}).resolve(), kept)
 
 
+@pytest.mark.long
 def test_a_method_that_draws_from_global_generators_makes_the_same_policies_again(
     tmp_path: Path, stranger: Callable[[type[Method]], str]
 ) -> None:
@@ -141,6 +142,7 @@ def test_a_link_that_leads_out_of_a_folder_is_refused_before_the_run(option: str
     assert not (tmp_path / "records").exists()
 
 
+@pytest.mark.long
 def test_a_killed_run_keeps_all_stages_once_it_has_finished(
     tmp_path: Path, execute_and_kill: Callable[..., None]
 ) -> None:
@@ -151,6 +153,7 @@ def test_a_killed_run_keeps_all_stages_once_it_has_finished(
     _assert_equal(stage_policies(spec.resolve(), tmp_path), stage_policies(spec.resolve()))
 
 
+@pytest.mark.long
 def test_a_run_killed_without_keeping_its_policies_keeps_them_all_if_it_goes_on_with_a_folder(
     tmp_path: Path, execute_and_kill: Callable[..., None]
 ) -> None:

@@ -25,6 +25,7 @@ def reports() -> Path:
     return kept
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("perturb", [False, True])
 def test_progress_adds_up_to_the_length_of_the_run(perturb: bool, tmp_path: Path, reports: Path) -> None:
     for _ in range(2):  # the second time the cache has the evaluation of the pretrained policy
@@ -34,6 +35,7 @@ def test_progress_adds_up_to_the_length_of_the_run(perturb: bool, tmp_path: Path
         assert sum(amounts) == pytest.approx(run_length(run.scenario, run.protocol))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("splits", [("test", "validation"), ("validation", "test")])
 def test_a_tuning_run_and_a_test_run_share_no_evaluation(
     splits: tuple[ScoredSplit, ScoredSplit], tmp_path: Path, reports: Path

@@ -370,6 +370,7 @@ def test_without_two_common_seeds_of_two_rows_no_deviation_is_known() -> None:
         assert deviation_of_differences("final_average", rows) is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("methods", "seeds", "deviation"), [(5, 3, 0.05), (8, 3, 0.1)])
 def test_boards_of_equal_methods_are_hardly_ever_split(methods: int, seeds: int, deviation: float) -> None:
     generator = np.random.default_rng(0)

@@ -241,6 +241,7 @@ def test_a_missing_cell_of_a_target_leaves_no_value_that_needs_it(scores: Callab
     }
 
 
+@pytest.mark.long
 def test_every_published_definition_has_an_interval(scores: Callable[..., Scores]) -> None:
     curves = {"curves": OWN_CURVES, "retained_curves": SKILL_CURVES}
     runs = {seed: scores(PUBLISHED, **curves) for seed in range(3)}

@@ -76,6 +76,7 @@ def test_each_policy_has_a_table_and_a_folder_of_its_own(name: str, folder: str)
     assert record_name("clbench/Toy-v0", "sft", 0, policy=name).parts == (folder, "sft", "seed-0.json")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("size", "least", "most"), [("base", 4.5e6, 5.5e6), ("large", 36e6, 44e6)])
 def test_larger_policies_have_about_5_and_40_million_parameters(size: str, least: float, most: float) -> None:
     for kind in POLICIES:

@@ -26,6 +26,7 @@ def test_the_built_in_policies_keep_the_contract(kind: str) -> None:
     check_policy(kind)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", POLICIES)
 def test_the_built_in_policies_keep_the_contract_with_pictures(kind: str) -> None:
     check_policy(kind, image_size=32)
@@ -93,6 +94,7 @@ class Downloaded(Constant):
     pretrained = True
 
 
+@pytest.mark.long
 def test_pretrained_weights_of_a_policys_own_may_be_the_same_for_all_seeds() -> None:
     check_policy(f"{__name__}:Downloaded")
 

@@ -438,6 +438,7 @@ def test_a_class_that_makes_no_object_is_named_by_every_check_that_needs_one() -
     assert found == [(name, "constructor") for name in names if name not in needless]
 
 
+@pytest.mark.long
 def test_a_check_passes_where_the_missing_default_is_given() -> None:
     (check,) = (check for check in method_checks(Demanding, rate=0.5) if str(check) == "sound_hooks")
     check()

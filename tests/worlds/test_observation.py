@@ -147,6 +147,7 @@ def test_pictures_change_in_perturbed_episodes_alone() -> None:
     assert np.array_equal(again, images[1])
 
 
+@pytest.mark.long
 def test_each_lane_is_seen_through_the_camera_of_its_task_with_the_view_of_its_seed(
     camera_of: Callable[[str], str],
 ) -> None:
@@ -165,6 +166,7 @@ def test_each_lane_is_seen_through_the_camera_of_its_task_with_the_view_of_its_s
     lanes.close()
 
 
+@pytest.mark.long
 def test_pictures_of_a_data_set_are_drawn_once(empty_caches: Path) -> None:
     first = observed(TASK, _states(5))
     (file,) = cache_folder().rglob("frames.safetensors")
@@ -196,6 +198,7 @@ def test_where_the_source_of_the_camera_changes_a_data_set_is_observed_anew(
         assert np.array_equal(numbers, shown)
 
 
+@pytest.mark.long
 def test_where_another_renderer_draws_a_data_set_is_observed_anew(
     empty_caches: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -280,6 +283,7 @@ def test_every_method_learns_from_pictures(name: str, tmp_path: Path) -> None:
     trainer.load(tmp_path / "1", 1)
 
 
+@pytest.mark.long
 def test_after_an_interruption_the_next_picture_is_that_of_its_own_state(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

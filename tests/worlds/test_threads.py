@@ -77,6 +77,7 @@ def test_a_team_that_nobody_closed_leaves_no_thread_behind(before: set[threading
     assert _own_threads(before) == []
 
 
+@pytest.mark.long
 def test_a_team_ends_with_an_owner_whose_method_its_threads_called(before: set[threading.Thread]) -> None:
     owner = Owner()
     assert len(_own_threads(before)) == 2

@@ -130,6 +130,7 @@ def test_the_bound_of_a_step_names_a_test_that_exists(bench: Bench) -> None:
         assert f"def {test}(" in (Path(__file__).parents[3] / path).read_text(encoding="utf-8")
 
 
+@pytest.mark.long
 def test_an_arm_whose_samples_weigh_the_same_does_not_count_and_the_page_says_so(bench: Bench) -> None:
     bench.add("sft")
     bench.add("sft@1")

@@ -48,6 +48,7 @@ def test_a_method_that_is_certainly_better_is_named_with_its_gain(
     assert [line.split(" | ")[1] for line in table.splitlines()[2:5]] == ["finch", "lora", "l2_sp"]
 
 
+@pytest.mark.long
 def test_without_one_the_page_says_so_and_names_the_largest_gain(
     even_board: Callable[..., Path], page: Callable[[], str]
 ) -> None:
@@ -131,6 +132,7 @@ def test_several_p_are_corrected_for_their_number(chances: list[float], says: st
     assert sentences == ([f"{says} Holm's correction for their number, {stay}."] if says else [])
 
 
+@pytest.mark.long
 def test_a_gain_that_is_not_certain_over_a_tied_setting_is_no_yes(
     even_board: Callable[..., Path], page: Callable[[], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -162,6 +162,7 @@ def test_the_stored_data_come_from_the_declaration_and_the_records(bench: Bench)
     assert "Parameters added on clbench/Toy-v0: 12." in stored
 
 
+@pytest.mark.long
 def test_the_row_of_the_board_is_next_to_three_others(bench: Bench) -> None:
     for method in ("consft", "sft", "experience_replay", "frozen"):
         for seed in range(2):
@@ -179,6 +180,7 @@ def test_the_row_of_the_board_is_next_to_three_others(bench: Bench) -> None:
     assert "| seeds | 2 | 2 | 2 | 2 |" in results
 
 
+@pytest.mark.long
 def test_the_command_makes_the_row_with_all_its_seeds_and_perturbed_worlds(bench: Bench) -> None:
     for seed in range(3):
         bench.add("finch", seed=seed)

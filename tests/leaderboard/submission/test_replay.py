@@ -46,6 +46,7 @@ def test_policies_that_follow_from_another_start_than_pretraining_gives_are_refu
     assert tiers.tier_of(mine) == "recomputed"
 
 
+@pytest.mark.long
 def test_a_record_may_hold_its_episodes_in_any_order(mine: Path, honest: Path) -> None:
     def turn_round(values: dict[str, Any]) -> None:
         values["episodes"] = {name: column[::-1] for name, column in values["episodes"].items()}
@@ -67,6 +68,7 @@ def test_the_record_of_a_machine_that_pretrains_otherwise_cannot_be_replayed_her
     assert tiers.tier_of(mine) == "recomputed"
 
 
+@pytest.mark.long
 def test_the_replayed_episodes_are_drawn_at_random_from_the_ends_of_all_stages(
     mine: Path, honest: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

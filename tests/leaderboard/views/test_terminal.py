@@ -120,6 +120,7 @@ def test_the_rows_come_as_json_with_null_for_what_is_missing(
     assert not (four_methods.parent / "site").exists()
 
 
+@pytest.mark.long
 def test_a_weak_pretrained_policy_is_named_on_every_form_of_the_board(
     four_methods: Path,
     add_full: Callable[..., Path],

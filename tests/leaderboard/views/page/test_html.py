@@ -95,6 +95,7 @@ def test_rows_show_their_groups_and_what_intervals_do_not_cover(records: Path) -
     assert "do not cover what all seeds share: demonstrations, scenes and questions" in words(section)
 
 
+@pytest.mark.long
 def test_perturbed_retention_has_a_column_only_where_a_row_has_it(
     add: Callable[..., Path], records: Path
 ) -> None:

@@ -192,6 +192,7 @@ def test_a_leader_that_learns_less_does_not_keep_most_of_those_that_learn_alike(
     )
 
 
+@pytest.mark.long
 def test_the_only_method_of_a_division_is_compared_with_plain_fine_tuning(board: Callable[..., Any]) -> None:
     rows = board(sft=matrix(0.1), replay=matrix(0.9))
     assert [verdict.name for verdict in verdicts(rows)] == ["prior-data-free", "prior demonstrations"]
