@@ -160,6 +160,7 @@ def test_the_reward_grows_while_the_expert_acts_and_is_highest_at_success() -> N
         assert rewards[-1] == max(rewards)
 
 
+@pytest.mark.long
 def test_experts_of_retained_tasks_do_no_target_task_by_chance() -> None:
     world = World()
     for known, task in itertools.product(SCENARIO.retained, SCENARIO.target):

@@ -119,6 +119,7 @@ def test_a_full_disk_ends_a_run_without_a_record_and_the_next_start_completes_it
     record_property("counts", {"full disks": len(shares)})
 
 
+@pytest.mark.long
 def test_sweeping_a_folder_of_finished_runs_removes_nothing(whole: tuple[Path, int]) -> None:
     folder, _ = whole
     before = sorted(folder.rglob("*"))

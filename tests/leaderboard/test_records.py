@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from helpers import unpacked
 
-import clbench
 from clbench.learning.registry import load_method, read_changes
 from clbench.records.paths import label_of, record_name, table_name, table_parts
 from clbench.records.reader import read_record
@@ -67,8 +67,8 @@ def promised(target: str) -> set[Path]:
 
 @pytest.fixture(scope="module")
 def board() -> Any:
-    """The board of Fetch-v1 by method."""
-    table = clbench.load_board(RECORDS)
+    """The committed board of Fetch-v1 by method; `make check` compares it with its records."""
+    table = pd.read_csv(RECORDS.parent / "site" / "leaderboard.csv")
     return table[table["scenario"] == "clbench/Fetch-v1"].set_index("method")
 
 
@@ -103,7 +103,6 @@ def test_the_pretrained_policy_has_its_skills_and_answers() -> None:
     assert np.mean(retained) >= 0.95
 
 
-@pytest.mark.long
 def test_plain_fine_tuning_learns_and_forgets(board: Any) -> None:
     assert board.loc["sft", "adaptation"] >= 0.85
     assert board.loc["sft", "kept"] <= 0.80

@@ -228,6 +228,7 @@ def test_a_record_with_a_criterion_reaches_every_tier(record: Record, tmp_path: 
     assert tiers.tier_of(spec.path(records)) == "retrained"
 
 
+@pytest.mark.long
 def test_a_record_whose_last_check_does_not_repeat_itself_stays_recomputed(
     record: Record, tmp_path: Path
 ) -> None:

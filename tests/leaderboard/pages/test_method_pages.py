@@ -191,6 +191,7 @@ def test_the_command_makes_the_row_with_all_its_seeds_and_perturbed_worlds(bench
     assert f"clbench run {SCENARIO} ewc\n" in part(pages["ewc"], "Command")
 
 
+@pytest.mark.long
 def test_the_claims_on_a_method_are_linked_with_their_verdicts(bench: Bench) -> None:
     for seed in range(2):
         bench.add("sft", seed=seed)

@@ -98,6 +98,7 @@ def test_a_record_of_older_code_is_set_aside_and_kept(capsys: pytest.CaptureFixt
     assert read_record(path).fingerprint["method"]["source"] != "another"
 
 
+@pytest.mark.long
 def test_a_class_that_breaks_the_contract_is_not_run(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stopped:
         submit("submitted:Broken")
