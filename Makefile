@@ -139,6 +139,7 @@ benchmark: .venv/installed-dev
 	done
 	$(BIN)/python benchmarks/workers.py
 	$(BIN)/python benchmarks/served_policy.py
+	$(BIN)/python benchmarks/page.py
 	$(BIN)/python benchmarks/scaling.py
 	$(BIN)/python benchmarks/overlap.py
 	$(BIN)/python benchmarks/report.py

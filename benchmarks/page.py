@@ -1,8 +1,8 @@
 """Size of the page, and time to make and show it from generated records: `python benchmarks/page.py`.
 
 The records have the shape of Fetch-v1's. A method is two numbers: how well it learns, and how much it keeps.
-The goal is less than 3 MB and 20 s with 15 methods, 5 seeds and 4 scenarios. Where Chromium is installed, the
-published page is opened, too: it should show its first text within a second of an empty page's.
+The goal is less than 3 MB and 20 s. Where Chromium is installed, the published page is opened, too: it should
+show its first text within a second of an empty page's.
 """
 
 from __future__ import annotations
@@ -14,8 +14,10 @@ import tempfile
 import time
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from result_files import write_results
 
 from clbench.base.entry_points import resolve
 from clbench.records.paths import record_path
@@ -23,6 +25,7 @@ from clbench.records.record import AnswerRow, Costs, EpisodeRow, PolicyRow, Reco
 from clbench.records.writer import write_record
 from clbench.spec.protocol import Split
 
+COUNTS = {"methods": 15, "seeds": 5, "scenarios": 4}
 GROUPS = {
     "retained": ["reach", "hover", "pick_and_place", "push", "push_left", "push_away"],
     "target": ["lift", "push_right", "pull", "press"],
@@ -44,34 +47,38 @@ REFERENCES = ("sft", "joint", "from_scratch", "frozen")
 
 
 def main() -> None:
-    """Make the records, then the page, and print the time that each step took."""
+    """Measure the page, and write the result."""
     parser = argparse.ArgumentParser(description=__doc__)
-    for name, count in (("methods", 15), ("seeds", 5), ("scenarios", 4)):
-        parser.add_argument(f"--{name}", type=int, default=count)
     parser.add_argument("--output", type=Path, help="where to keep the page")
     arguments = parser.parse_args()
+    text, result = measure(**COUNTS)
+    if arguments.output:
+        arguments.output.write_text(text, encoding="utf-8")
+    if chromium := shutil.which("chromium") or shutil.which("chromium-browser"):
+        addresses = {"published page": PUBLISHED.as_uri(), "empty page": EMPTY}
+        result["first_text_ms"] = {name: first_text(chromium, one) for name, one in addresses.items()}
+    write_results("page", result)
+    print(result)
+
+
+def measure(methods: int, seeds: int, scenarios: int) -> tuple[str, dict[str, Any]]:
+    """Return the page of generated records, and its rows, megabytes and seconds."""
     compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
     page, pictures = (resolve(f"clbench.leaderboard.views.page.html:{name}") for name in ("page", "pictures"))
     with tempfile.TemporaryDirectory() as folder:
         records = Path(folder) / "leaderboard" / "records"
-        make_records(records, arguments.methods, arguments.seeds, arguments.scenarios)
-        begin = time.monotonic(), time.process_time()
+        make_records(records, methods, seeds, scenarios)
+        begin = time.perf_counter()
         board = compute_board(records)
-        read = time.monotonic(), time.process_time()
+        read = time.perf_counter()
         if board.not_shown:  # a page without rows is made in no time
             raise SystemExit(f"The records are refused: {board.not_shown[0].reason}")
         text = page(board, {})
         pictures(board)
-        end = time.monotonic(), time.process_time()
-    if arguments.output:
-        arguments.output.write_text(text, encoding="utf-8")
-    print(f"{len(board.rows)} rows, {len(text.encode()) / 1e6:.2f} MB")
-    for part, first, last in (("board", begin, read), ("page and pictures", read, end), ("all", begin, end)):
-        wall, processor = (late - early for early, late in zip(first, last, strict=True))
-        print(f"{part}: {wall:.1f} s, {processor:.1f} s of processor time")
-    if chromium := shutil.which("chromium") or shutil.which("chromium-browser"):
-        ours, empty = first_text(chromium, PUBLISHED.as_uri()), first_text(chromium, EMPTY)
-        print(f"first text of the published page: {ours:.0f} ms, of an empty page: {empty:.0f} ms")
+        end = time.perf_counter()
+    counts = {"methods": methods, "seeds": seeds, "scenarios": scenarios, "rows": len(board.rows)}
+    seconds = {"board": read - begin, "page and pictures": end - read}
+    return text, {**counts, "megabytes": len(text.encode()) / 1e6, "seconds": seconds}
 
 
 def first_text(chromium: str, address: str) -> float:

@@ -180,6 +180,24 @@ def _served_policy() -> Iterator[str]:
     yield ""
 
 
+def _page() -> Iterator[str]:
+    found = _read("page")
+    board, page = found["seconds"].values()
+    yield "## The page of the board"
+    yield ""
+    yield (
+        f"A page of {found['rows']} rows with {found['seeds']} seeds each has {found['megabytes']:.2f} MB. "
+        f"The board takes {board:.0f} s, and the page with its pictures {page:.0f} s."
+    )
+    if "first_text_ms" in found:
+        published, empty = found["first_text_ms"].values()
+        yield (
+            f"Chromium shows the first text of the published page after {published:.0f} ms, and that of an "
+            f"empty page after {empty:.0f} ms."
+        )
+    yield ""
+
+
 def _scaling() -> Iterator[str]:
     found = _read("scaling")
     yield "## How cost grows"
@@ -249,7 +267,7 @@ def _picture() -> str:
 
 def main() -> None:
     """Write the page and the picture."""
-    sections = (_rollouts, _whole_run, _steps, _workers, _served_policy, _scaling)
+    sections = (_rollouts, _whole_run, _steps, _workers, _served_policy, _page, _scaling)
     measured = (line for section in sections for line in section())
     text = "\n".join([INTRODUCTION, *measured, "", TRIED])
     (DOCS / "performance.md").write_text(text.rstrip("\n") + "\n", encoding="utf-8")

@@ -248,19 +248,12 @@ def test_every_quantity_whose_cost_may_grow_is_measured(
     assert prepare()(size) > 0
 
 
-def test_the_size_of_the_page_is_that_of_a_page_with_all_rows() -> None:
-    command = [
-        sys.executable,
-        os.fspath(BENCHMARKS / "page.py"),
-        "--methods",
-        "2",
-        "--seeds",
-        "1",
-        "--scenarios",
-        "1",
-    ]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    assert done.stdout.startswith("2 rows, ")
+def test_the_size_of_the_page_is_that_of_a_page_with_all_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    text, found = importlib.import_module("page").measure(methods=2, seeds=1, scenarios=1)
+    assert found["rows"] == 2
+    assert found["megabytes"] == len(text.encode("utf-8")) / 1e6
+    assert all(name in text for name in ("Made0-v0", "sft", "joint"))
 
 
 # ---- overlap ---------------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
 
 README = Path(__file__).parents[1] / "README.md"
+CLAIMS = README.parent / "docs" / "reference" / "claims.md"
 BOARD = README.parent / "docs" / "guide" / "board.md"
 
 
@@ -102,9 +103,16 @@ def test_the_pictures_of_the_guide_are_drawn(folder: Path) -> None:
     assert all((folder / name).stat().st_size for name in ("matrix.png", "curves.png", "plane.pdf"))
 
 
-def test_the_readme_states_the_number_of_claims() -> None:
+def test_the_readme_states_how_many_claims_there_are_and_how_many_are_decided() -> None:
     claims = resolve("clbench.leaderboard.claims.judges:CLAIMS")
-    assert f"judge {len(claims)} statements of papers" in README.read_text(encoding="utf-8")
+    rows = re.findall(r"^\| \[(\w+)\].*? \| .*? \| .*? \| (.*?) \|", CLAIMS.read_text("utf-8"), re.MULTILINE)
+    assert {identifier for identifier, _ in rows} == set(claims)
+    decided = {identifier for identifier, verdict in rows if verdict.startswith(("holds", "does not hold"))}
+    text = " ".join(README.read_text(encoding="utf-8").split())
+    stated = (
+        f"judge {len(claims)} statements of papers; {len(decided)} of them are decided on at least one board"
+    )
+    assert stated in text
 
 
 def test_every_command_and_file_that_the_readme_names_exists() -> None:

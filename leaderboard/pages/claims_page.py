@@ -24,9 +24,11 @@ INTRODUCTION = (
     "AEGIS and CapVector say beyond their abstracts, their figures and tables included, is from notes by "
     "other readers: we have not read these papers. We have read the paper on Fast-dVLA. The rules were "
     "written before the records of these boards, but some changed later: the list says how many, each rule "
-    "says when, and docs/history.md says why. One review of the rules turned 15 of 41 verdicts without a "
-    'new record, 13 of them into "cannot be shown here"; docs/history.md lists them, and says that boards '
-    "got more seeds after a first look. `sft` is plain fine-tuning. Most claims are judged on scenarios "
+    "says when, and docs/history.md says why. C1 was judged on clbench/LiberoSpatial-v1, and A5 on "
+    "clbench/FetchKnowledge-v1, after the first records of these boards. One review of the rules turned 15 "
+    'of 41 verdicts without a new record, 13 of them into "cannot be shown here"; docs/history.md lists '
+    "them, and says that boards got more seeds after a first look. `sft` is plain fine-tuning. Most claims "
+    "are judged on scenarios "
     "whose stages end when the target is learned, so that methods are compared at equal learning: each at "
     "the settings that tuning chose, or at one learning rate, written as `sft@0.3` for sft at 0.3 of the "
     "scenario's learning rate. `lora+rank=4` is lora with one setting changed. On "
