@@ -56,7 +56,7 @@ class Bench:
         marks: list[float] = []
 
         def after(step: Step) -> bool:
-            if step.trains:
+            if step.loss is not None:
                 marks.append(time.perf_counter())
             return len(marks) > steps
 

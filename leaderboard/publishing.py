@@ -1,6 +1,6 @@
 """The folder `site` next to the records: every form of the board, and what it was made from.
 
-Computing the board takes 10 s, most of it for intervals. Therefore the folder keeps the numbers in
+Computing the board takes half a minute, most of it for intervals. Therefore the folder keeps the numbers in
 `board.json`, with hashes of what they were computed from, and of themselves. They are read back while nothing
 of it changes.
 """

@@ -66,7 +66,7 @@ class WeightedSFT(Method, ABC):
         """Return the length T of the schedule in steps."""
         if not progress.to_criterion:
             return self.schedule * progress.steps
-        # the step factor falls short of its full value by half of the warm-up
+        # the step factor falls short of its full value by about half of the warm-up
         return self.schedule * (WARM_UP / 2 + LEARNED_AFTER / self.step_factor)
 
     def temperature(self, progress: Progress) -> float:
@@ -90,7 +90,7 @@ class WeightedSFT(Method, ABC):
         """Return the mean of the weighted losses."""
         losses = policy.action_loss(batch)
         weights = self.weights(losses, progress)
-        counts = torch.histogram(weights.cpu(), torch.tensor(BINS)).hist
+        counts = torch.histogram(weights.float().cpu(), torch.tensor(BINS)).hist
         part = int(SLICES * progress.step / self.length(progress))
         self.counts[min(part, SLICES - 1)] += counts.long()
         return (weights * losses).mean()

@@ -112,6 +112,7 @@ class FastDVLA(Method):
         inputs = {
             "policy": hash_of_tensors(policy.state_dict()),
             "device": str(policy.device),
+            "instructions": torch.backends.cpu.get_cpu_capability(),
             "drawn": hash_of_tensors(columns),
             "settings": [self.auxiliary, self.steps, self.step_size],
             "source": source_hash(__name__, *TRAINING_SOURCES),

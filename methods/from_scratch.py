@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
+from clbench.base.errors import InputError
 from clbench.learning.method import Method, Stage
 from clbench.learning.prior import Uses
 from clbench.policy.kinds import new_policy
@@ -27,7 +28,14 @@ class FromScratch(Method):
     tunes = ("step_factor", (2.2, 5.0))  # new weights need larger steps; pretraining's are 5 times as large
 
     def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
-        """Return all parameters, set to new random weights."""
+        """Return all parameters, set to new random weights.
+
+        Raises:
+            InputError: A new policy of this class has pretrained weights of its own.
+        """
+        if policy.pretrained:
+            name = type(policy).__name__
+            raise InputError(f"from_scratch needs untrained weights, and a new {name} has pretrained ones.")
         fresh = new_policy(policy.config, seed=stage.seed)
         with torch.no_grad():
             for parameter, value in zip(policy.parameters(), fresh.parameters(), strict=True):

@@ -41,7 +41,7 @@ class LwF(Method):
 
     def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
         """Return all parameters, and keep a frozen copy of the policy."""
-        self.teacher = deepcopy(policy).requires_grad_(False)
+        self.teacher = deepcopy(policy).eval().requires_grad_(False)
         return policy.parameters()
 
     def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:

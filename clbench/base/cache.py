@@ -61,7 +61,7 @@ def hash_of_tensors(tensors: Mapping[str, Tensor]) -> str:
     for name, value in sorted(tensors.items()):
         digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
         # as bytes: NumPy has no bfloat16
-        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
+        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()[:16]
 
 
@@ -185,6 +185,9 @@ def _fault(folder: Path, key: str) -> str | None:
 
 def _file_hashes(folder: Path) -> dict[str, str]:
     paths = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != MANIFEST)
-    return {
-        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths
-    }
+    return {path.relative_to(folder).as_posix(): _file_hash(path) for path in paths}
+
+
+def _file_hash(path: Path) -> str:
+    with path.open("rb") as file:  # in pieces: a policy may be larger than the memory that is left
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -46,7 +46,8 @@ def import_module(module: str, needed_for: str) -> Any:
         UnknownNameError: The module, or a module that it imports, does not exist.
         InputError: A module that is not part of clbench raises an error while it is imported.
     """
-    hint = f" Did you mean {needed_for.replace('.py:', ':')!r}?" if module.endswith(".py") else ""
+    near = module.removeprefix("./").removesuffix(".py").replace("/", ".")
+    hint = f" Did you mean {near + needed_for.removeprefix(module)!r}?" if near != module else ""
     if not is_module(module):
         raise UnknownNameError(f"No module {module!r} can be imported for {needed_for!r}.{hint}")
     try:

@@ -54,7 +54,9 @@ def draws_restored() -> Iterator[None]:
     import torch
 
     python, numpy_state = random.getstate(), np.random.get_state()  # noqa: NPY002 - to restore it
-    with torch.random.fork_rng():
+    # To read its generator would start a GPU that nobody has used: it has no draws to restore.
+    idle = torch.cuda.is_available() and not torch.cuda.is_initialized()  # type: ignore[no-untyped-call]
+    with torch.random.fork_rng([] if idle else range(torch.accelerator.device_count())):
         try:
             yield
         finally:

@@ -132,8 +132,13 @@ def tune(
             write_tuned(write, without_module(scenario), numbers, chosen)
         read = tuned_file(without_module(scenario))
         if write.resolve() != read.resolve():
-            copy = f"copy {write} there, on every machine that runs or shows these records."
-            print_plain(Console(stderr=True), f"`clbench run` reads {read}: {copy}")
+            how = (
+                f"repeat this command with --write {read}, which keeps its other methods"
+                if read.exists()
+                else f"copy {write} there"
+            )
+            told = f"`clbench run` reads {read}: {how}, on every machine that runs or shows these records."
+            print_plain(Console(stderr=True), told)
     if len(chosen) < len(names):
         without = ", ".join(name for name in names if name not in chosen)
         print_plain(Console(stderr=True), f"Failed at every learning rate: {without}.", "bold red")

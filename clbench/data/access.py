@@ -2,8 +2,9 @@
 
 The hooks of a method may use the objects that the runner passes to them, and no data of a later stage. They
 may run the validation episodes of tasks up to their own, but no test episode, and ask no test question. They
-may read the demonstrations of their own target, and of earlier tasks if `uses` declares it. After each hook
-the policy must still have the normalisation of the retained skills, its vocabulary and its sizes.
+may read the demonstrations of their own target, and of earlier tasks if `uses` declares it. After `prepare`,
+each stage and `load_state`, the policy must still have the normalisation of the retained skills, its
+vocabulary and its sizes.
 
 These checks find mistakes. They do not stop a method that avoids the functions of clbench, see
 `docs/guide/security.md`.
@@ -43,7 +44,7 @@ _ours: ContextVar[BaseException | None] = ContextVar("ours", default=None)
 """Exception that leaves the runner's own code inside a hook."""
 
 NORMALISATION = ("state_mean", "state_std", "action_mean", "action_std")
-"""Buffers of a policy that the demonstrations of pretraining alone determine."""
+"""Buffers of a policy that hold the normalisation, which the demonstrations of pretraining determine."""
 
 
 class LeakError(ClbenchError, RuntimeError):

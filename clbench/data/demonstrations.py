@@ -372,6 +372,5 @@ def _chunks(episode: Demonstration, chunk: int) -> tuple[NDArray[np.float32], ND
 
 def load_demonstrations(task: Task, scenario: Scenario, config: PolicyConfig) -> Demonstrations:
     """Return the demonstrations of `task` in chunks that fit a policy; they are collected on first use."""
-    check_demonstrations(task.name)
     episodes = read_dataset(dataset_folder(task, scenario.budget))
     return Demonstrations.of_task(task, episodes, config.chunk, config.text_length)

@@ -26,6 +26,7 @@ from clbench.base.source import DATA_SOURCES, source_hash
 from clbench.data.access import check_questions
 from clbench.data.demonstrations import demonstrate, simulator_versions
 from clbench.policy.batch import QuestionBatch
+from clbench.spec.fields import check_tuple
 from clbench.spec.language import TEXT_LENGTH, encode, word_id
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import packages_of
@@ -61,6 +62,9 @@ class QuestionKind:
     """Possible answers, each a word of the vocabulary."""
     answer: Callable[[NDArray[np.float32]], Answers]
     """Function that maps states (N, S) to the indices of their answers (N,)."""
+
+    def __post_init__(self) -> None:
+        check_tuple(self, str, "wordings", "answers")
 
 
 def scenes_folder(scenario: Scenario, progress: ProgressCallback = no_progress) -> Path:

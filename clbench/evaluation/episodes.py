@@ -66,7 +66,7 @@ class Episode:
         return EpisodeKey(self.task, self.split, self.number)
 
 
-@dataclass
+@dataclass(eq=False)  # identity: arrays have no truth value
 class Live:
     """One running episode."""
 

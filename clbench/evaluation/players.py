@@ -370,7 +370,7 @@ def _numbers(action: Any, space: spaces.Box, rows: tuple[int, ...]) -> NDArray[n
         numbers = np.asarray(action, np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"The agent's action must be {space.shape[0]} numbers, not a {type(action).__name__}."
+            f"The agent's action must be {space.shape[0]} numbers, not a {type(action).__name__} ({error})."
         ) from error
     if numbers.shape != shape:
         raise InputError(f"The agent's action has the shape {numbers.shape}, not {shape}.")

@@ -29,6 +29,7 @@ from clbench.base.errors import InputError
 from clbench.base.text import counted, did_you_mean, quoted
 from clbench.data.demonstrations import Demonstration
 from clbench.exchange.shown import shown, steps_per_second
+from clbench.spec.language import LENGTHS, UnknownWordError, word_ids
 from clbench.spec.task import Task
 from clbench.worlds.world import World
 
@@ -204,7 +205,7 @@ class _File:
         words = "".join(parts)  # LIBERO joins it, too
         # LIBERO's files name the task, and have words of their own ("open the middle layer of the drawer")
         is_named = PurePosixPath(str(data.attrs.get("bddl_file_name"))).stem == self._task.name
-        if parts and not is_named and words.strip('" \n') not in self._task.instructions:
+        if parts and not is_named and not self._is_instruction(words):
             raise self._error(
                 f"its instruction is {quoted(words)}, which the task {self._task.name} does not have: add it "
                 f"to the instructions of the task if it means the same. It has {self._task.instructions}"
@@ -218,6 +219,14 @@ class _File:
                 f"it was recorded at {rate:g} steps per second, but the world {self._task.world} makes "
                 f"{self._rate:g}: an action would last another time"
             )
+
+    def _is_instruction(self, words: str) -> bool:
+        """Return whether the task has an instruction, as a policy reads it: without case and punctuation."""
+        try:
+            found = word_ids([words], LENGTHS[-1])
+        except UnknownWordError:
+            return False
+        return any(found == word_ids([one], LENGTHS[-1]) for one in self._task.instructions)
 
     def _demonstration(self, data: h5py.Group, name: str) -> Demonstration:
         group, where = data.get(name), f"data/{name}"

@@ -26,6 +26,7 @@ from clbench.runs.spec import ResolvedRun, RunSpec, check_device
 from clbench.spec.identifiers import check_known, installed_methods
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.protocol import DEFAULT_SEEDS, MOST_SEEDS
+from clbench.spec.registry import importable
 
 if TYPE_CHECKING:
     from clbench.jobs.plan import Plan
@@ -215,7 +216,8 @@ def run_specs(firsts: Sequence[RunSpec], seeds: int, records: Path, workers: int
 
     Raises:
         UnknownNameError: There is no such scenario, method or hyper-parameter.
-        InputError: A value cannot be used; the message says which.
+        InputError: A value cannot be used; the message says which. Or other processes cannot import the
+            scenario or the policy.
         RunsFailedError: A run failed.
     """
     for name, value in (("seeds", seeds), ("workers", workers)):
@@ -224,6 +226,9 @@ def run_specs(firsts: Sequence[RunSpec], seeds: int, records: Path, workers: int
     if seeds > MOST_SEEDS:
         raise InputError(f"seeds must be at most {MOST_SEEDS:,}, not {seeds}.")
     check_known([one.scenario for one in firsts], [one.method for one in firsts])
+    firsts = [replace(one, scenario=importable(one.scenario)) for one in firsts]
+    if any(one.policy.startswith("__main__:") for one in firsts):
+        raise InputError("A policy must be in a module: other processes cannot import a class of a notebook.")
     for device in {one.device for one in firsts}:
         check_device(device)
     specs = [replace(one, seed=one.seed + number) for one in firsts for number in range(seeds)]

@@ -27,11 +27,6 @@ class Step:
     learning_rate: float | None
     """Learning rate of the last optimiser group; None where there is no loss."""
 
-    @property
-    def trains(self) -> bool:
-        """Whether an optimiser step was taken: a criterion is also checked before the first step."""
-        return self.done > 0 and self.loss is not None
-
 
 def adapt(
     policy: Policy,

@@ -60,7 +60,7 @@ def learning_rate_factor(step: int, steps: int) -> float:
 def deterministic(device: str = "cpu") -> Iterator[None]:
     """Use one thread and deterministic kernels inside, so that a computation repeats itself bit for bit."""
     if device != "cpu":
-        # without it cuBLAS may choose another kernel each time, and PyTorch refuses deterministic mode
+        # with another workspace cuBLAS may choose another kernel each time
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
     threads, algorithms = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
     warn_only = torch.is_deterministic_algorithms_warn_only_enabled()

@@ -127,12 +127,8 @@ class Trainer:
             )
         self.method = self.new_method()
         self.where = "load_state() after watch_pretraining"
-        moved = {
-            name: value.to(self.device) if isinstance(value, torch.Tensor) else value
-            for name, value in state.items()
-        }
         with self._hooks(0):
-            self.method.load_state(self.policy, moved)
+            self.method.load_state(self.policy, state)
         return self.scenario.budget.pretraining_steps
 
     def learn(self, number: int, after: Callable[[Step], bool | None]) -> int:

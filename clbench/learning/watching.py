@@ -44,8 +44,14 @@ def watch(
         progress: Called with the number of steps done since its last call.
 
     Raises:
-        MethodError: The method does not declare prior demonstrations, or changed the pretraining.
+        MethodError: The method does not declare prior demonstrations or changed the pretraining, or there was
+            none, as the policy has pretrained weights of its own.
     """
+    if pretrained.pretrained:
+        policy = type(pretrained).__name__
+        raise MethodError(
+            f"watch_pretraining() has nothing to watch: {policy} has pretrained weights of its own."
+        )
     if method.uses.demonstrations == "never":
         raise MethodError(
             "watch_pretraining() learns from the demonstrations of the skills: "
@@ -53,6 +59,7 @@ def watch(
         )
     inputs = {
         **pretraining_inputs(scenario, seed),
+        "instructions": torch.backends.cpu.get_cpu_capability(),
         "method": describe_method(type(method))["source"],
         "class": f"{type(method).__module__}:{type(method).__qualname__}",
         "settings": {name: repr(value) for name, value in dataclasses.asdict(method).items()},
@@ -76,4 +83,5 @@ def watch(
             state = method.state()
         write_state(partial, state)
 
-    return read_state(cached(cache_folder() / "watched" / hash_of(inputs), inputs, make))
+    folder = cached(cache_folder() / "watched" / hash_of(inputs), inputs, make)
+    return read_state(folder, pretrained.device)

@@ -110,6 +110,7 @@ class Report:
             UnknownNameError: There is no such metric or method.
         """
         by_method = self.values[load_metric(metric).name]
+        method = None if method is None else str(method)  # a table may name methods by numbers
         if method is not None and method not in by_method:
             raise unknown("method", method, by_method)
         return by_method[next(iter(by_method)) if method is None else method]

@@ -186,6 +186,7 @@ def _cells(row: dict[str, str], long: bool, where: str) -> list[tuple[Cell, str]
         if row.get(key) == "":
             raise InputError(f"{where}: the {key} has no name.")
     method, seed, stage = (row.pop(key, "") for key in KEYS)
+    stage = stage.removesuffix(".0")  # pandas writes so if a cell of the column is missing
     if not stage.isascii() or not stage.isdigit():
         raise InputError(
             f"{where}: stage must be a whole number, how many targets were learned, not {quoted(stage)}."

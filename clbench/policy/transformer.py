@@ -42,7 +42,7 @@ class TransformerPolicy(Policy):
     def __init__(self, config: PolicyConfig, seed: int = 0) -> None:
         super().__init__(config, seed)
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+            torch.default_generator.manual_seed(seed)  # `torch.manual_seed` would also seed every GPU
             self.backbone = Backbone(
                 config.state_size,
                 config.vocabulary_size,

@@ -274,7 +274,7 @@ class StagedRun:
             InputError: There is no such stage, or an earlier one comes next; and as for `kept`.
             RecordError: The file is damaged.
         """
-        if type(stage) is not int or not 0 <= stage <= self.last:
+        if not is_whole(stage) or not 0 <= stage <= self.last:
             raise InputError(f"{self.scenario.id} has stages 0 to {self.last}, not {stage!r}.")
         record = self.kept(stale=again and stage == 0)
         following = self.next_after(record)

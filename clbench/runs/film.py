@@ -99,7 +99,7 @@ def shoot(
     takes: list[list[Take]] = [[] for _ in trials]
     with closing(Evaluator(scenario, seed)) as evaluator, opened_worlds(render_mode="rgb_array") as world:
         for policy in policies:
-            with deterministic():
+            with deterministic(str(policy.device)):
                 episodes, actions = _act(evaluator, policy, trials)
             for column, trial, episode in zip(takes, trials, episodes, strict=True):
                 task = trial.task

@@ -34,7 +34,7 @@ from clbench.runs.fingerprint import arithmetic, fingerprint
 from clbench.runs.length import relearning_length, relearns, run_length
 from clbench.runs.relearning import relearn
 from clbench.runs.spec import ResolvedRun, RunSpec
-from clbench.runs.stages import NOT_THE_METHOD, drop_stages, has_stages, keep_stage, machine_needed
+from clbench.runs.stages import NOT_THE_METHOD, drop_stages, keep_stage, keeps_stage, machine_needed
 from clbench.runs.start import evaluate_start
 from clbench.runs.step_time import step_ratio
 from clbench.runs.tensorboard import Log, require_tensorboard
@@ -367,7 +367,7 @@ class _Run:
             folder = self._checkpoint(number)
             if not is_cached(folder, {**self.inputs, "stage": number}):
                 continue
-            if self.kept is not None and not has_stages(self.run, self.kept, number):
+            if self.kept is not None and not keeps_stage(self.run, self.kept, number, folder):
                 continue
             self.record = read_record(folder / "record.json")
             self.seconds_before = self.record.timing["seconds"]

@@ -7,6 +7,7 @@ itself bit for bit, so policies that are made again equal the original ones.
 from __future__ import annotations
 
 import dataclasses
+import filecmp
 import functools
 import logging
 import shutil
@@ -28,6 +29,7 @@ from clbench.learning.trainer import STAGE_FILES, Trainer, load_stage, training_
 from clbench.policy.checkpoint import CheckpointError
 from clbench.policy.policy import Policy
 from clbench.records.paths import stage_folder
+from clbench.runs.fingerprint import arithmetic
 from clbench.spec.protocol import Point
 from clbench.worlds.gl_backend import RenderingError
 
@@ -188,6 +190,14 @@ def has_stages(run: ResolvedRun, checkpoints: Path, last: int | None = None) -> 
     return _are_whole(run, _kept(run, checkpoints), last)
 
 
+def keeps_stage(run: ResolvedRun, checkpoints: Path, number: int, source: Path) -> bool:
+    """Return whether all policies up to stage `number` are kept, the last one as it is in `source`."""
+    kept, name = _kept(run, checkpoints), STAGE_FILES[0]
+    return _are_whole(run, kept, number) and filecmp.cmp(
+        stage_folder(kept, number) / name, source / name, shallow=False
+    )
+
+
 def _are_whole(run: ResolvedRun, folder: Path, last: int | None = None) -> bool:
     last = len(run.scenario.target) if last is None else last
     return all(is_cached(stage_folder(folder, n), _identity(run, n)) for n in range(last + 1))
@@ -199,9 +209,10 @@ def _kept(run: ResolvedRun, checkpoints: Path) -> Path:
 
 
 def _made(run: ResolvedRun) -> Path:
-    """Return the folder in the cache for policies that this version of the code made again."""
-    code = {"method": describe_method(run.method), **training_inputs(run.scenario, run.spec.seed)}
-    return cache_folder() / "stages" / hash_of({**_identity(run, 0), **code})
+    """Return the folder in the cache for policies that this code made again on hardware like this."""
+    made_by = {"method": describe_method(run.method), "hardware": arithmetic(run.spec.device)}
+    inputs = {**_identity(run, 0), **made_by, **training_inputs(run.scenario, run.spec.seed)}
+    return cache_folder() / "stages" / hash_of(inputs)
 
 
 def keep_stage(run: ResolvedRun, checkpoints: Path, number: int, source: Path) -> None:
@@ -211,7 +222,9 @@ def keep_stage(run: ResolvedRun, checkpoints: Path, number: int, source: Path) -
         for name in STAGE_FILES:
             shutil.copyfile(source / name, folder / name)
 
-    cached(stage_folder(_kept(run, checkpoints), number), _identity(run, number), write)
+    folder = stage_folder(_kept(run, checkpoints), number)
+    shutil.rmtree(folder, ignore_errors=True)  # another version of the code leaves the same identity
+    cached(folder, _identity(run, number), write)
 
 
 def drop_stages(run: ResolvedRun, checkpoints: Path) -> None:

@@ -16,6 +16,7 @@ from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.trainer import training_inputs
 from clbench.policy.policy import Policy
 from clbench.records.record import Record
+from clbench.runs.fingerprint import arithmetic
 from clbench.runs.length import point_length
 from clbench.runs.spec import ResolvedRun
 
@@ -88,6 +89,7 @@ def _kept(run: ResolvedRun, policy: Policy) -> tuple[Path, dict[str, Any]]:
         "policy": hash_of_tensors(policy.state_dict()),
         "scenario": dataclasses.asdict(run.scenario_info),
         "spec": [spec.seed, spec.device, spec.split, spec.perturb],
+        "hardware": arithmetic(spec.device),
         **training_inputs(run.scenario, spec.seed),
     }
     return cache_folder() / "reports" / hash_of(inputs), inputs

@@ -62,7 +62,7 @@ def _seconds(trainer: Trainer, number: int) -> float | None:
     marks: list[float] = []
 
     def after(step: Step) -> bool:
-        if step.trains:
+        if step.loss is not None:
             if trainer.device.type == "cuda":
                 torch.cuda.synchronize(trainer.device)
             marks.append(time.perf_counter())

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from clbench.base.errors import InputError
+from clbench.base.errors import InputError, WrongTypeError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import seeded
 from clbench.base.text import printable
@@ -25,6 +25,7 @@ from clbench.records.reader import RecordError, read_record
 from clbench.records.record import EXTERNAL_USES, Record
 from clbench.runs.agents import UNFINISHED, StagedRun
 from clbench.spec.registry import load_scenario
+from clbench.worlds.schedule import is_whole
 
 LOG = logging.getLogger("clbench")
 
@@ -114,8 +115,12 @@ def score(
     Raises:
         InputError: Another stage comes next, a record exists already, `executed` is not that of stage 0, the
             earlier stages had another version of the scenario or its simulator, the actions have the wrong
-            shape, or the name, the seed or the stage is invalid.
+            shape, or a name or number is invalid.
+        WrongTypeError: `data` is no text.
     """
+    executed, steps = _whole("executed", executed, 1), _whole("steps", steps, 0)
+    if data is not None and not isinstance(data, str):
+        raise WrongTypeError(f"data must be words, not {data!r}.")
     run = StagedRun(load_scenario(scenario), method, seed, Path(records), EXTERNAL_USES)
     begin = time.perf_counter()
     record = run.begin(stage, None if executed is None else {"executed": executed}, policy, restart)
@@ -146,6 +151,15 @@ def score(
     run.time(record, None, time.perf_counter() - begin)
     run.keep(record, stage)
     return record
+
+
+def _whole(name: str, value: int | None, least: int) -> int | None:
+    """Return a whole number, of Python or NumPy, as Python's."""
+    if value is None:
+        return None
+    if not is_whole(value) or value < least:
+        raise InputError(f"{name} must be a whole number from {least}, not {value!r}.")
+    return int(value)
 
 
 def _warn_if_known(server: Mapping[str, Any], record: Record, run: StagedRun, stage: int) -> None:

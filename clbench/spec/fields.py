@@ -6,6 +6,7 @@ import math
 
 from clbench.base.entry_points import is_entry_point
 from clbench.base.errors import InputError, WrongTypeError
+from clbench.base.text import quoted
 
 
 def check_whole(part: object, least: int, *fields: str, most: int | None = None) -> None:
@@ -39,6 +40,23 @@ def check_share(part: object, *fields: str) -> None:
         check_number(part, name)
         if not 0 <= getattr(part, name) <= 1:
             raise InputError(f"{_place(part, name)} must be from 0 to 1, not {getattr(part, name)}.")
+
+
+def check_tuple(part: object, kind: type, *fields: str) -> None:
+    """Check that fields of `part` are tuples whose entries are all of a kind.
+
+    Raises:
+        WrongTypeError: A field is no tuple, or has another entry.
+    """
+    entry = "text" if kind is str else kind.__name__
+    for name in fields:
+        value = getattr(part, name)
+        if isinstance(value, tuple) and all(isinstance(one, kind) for one in value):
+            continue
+        found = f"one {entry}" if isinstance(value, kind) else quoted(repr(value))
+        raise WrongTypeError(
+            f"{_place(part, name)} must be a tuple of {entry}s, not {found}; a tuple of one is (one,)."
+        )
 
 
 def check_entry_point(part: object, *fields: str) -> None:

@@ -26,7 +26,8 @@ _IDENTIFIER = r"[A-Za-z_]\w*"
 _WORD = r"[A-Za-z0-9]\w*(?:[.-]\w+)*"
 _SCENARIO = re.compile(rf"[A-Za-z]\w*(?:-\w+)*/{_WORD}-v\d{{1,4}}", re.ASCII)
 _METHOD = re.compile(
-    rf"(?:{_WORD}/)?[A-Za-z]\w*(?:-\w+)*|{_IDENTIFIER}(?:\.{_IDENTIFIER})*:{_IDENTIFIER}", re.ASCII
+    rf"[A-Za-z]\w*(?:-\w+)*|{_WORD}/[A-Za-z]\w*(?:[.-]\w+)*|{_IDENTIFIER}(?:\.{_IDENTIFIER})*:{_IDENTIFIER}",
+    re.ASCII,
 )
 _CHANGES = re.compile(rf"(?:\+{_IDENTIFIER}=[\w .,()\[\]'+-]*[\w)\]'])*", re.ASCII)
 _PLAIN = re.compile(r"\w+(?:[.-]\w+)*", re.ASCII)
@@ -106,7 +107,8 @@ def check_method_name(method: str) -> None:
     """
     if len(method) > LONGEST or not _METHOD.fullmatch(method):
         raise InputError(
-            f"{quoted(method)} cannot be the name of a method: it must be package/name or module:Class."
+            f"{quoted(method)} cannot be the name of a method: it must be package/name or module:Class. "
+            "A name has letters, digits, _, and single - and . between them, and begins with a letter."
         )
     _check_reserved(method)
     _check_alike("method", method, built_in_methods())

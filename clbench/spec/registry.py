@@ -30,7 +30,7 @@ def register(scenario_id: str, entry_point: str) -> None:
             entry point, or uses our namespace; or the entry point has another form.
     """
     check_scenario_id(scenario_id)
-    if not is_entry_point(entry_point):
+    if not isinstance(entry_point, str) or not is_entry_point(entry_point):
         raise InputError(f"{entry_point!r} must be the place of a scenario, as 'package.module:SCENARIO'.")
     if scenario_id.startswith("clbench/") and not entry_point.startswith(("clbench.", "clbench:")):
         raise InputError(f"{scenario_id!r} is in the namespace of clbench: choose your own.")
@@ -55,6 +55,23 @@ def load_scenario(scenario_id: str) -> Scenario:
         MissingPackageError: A package that its tasks need is not installed; the message says how to get it.
     """
     return opened_scenario(registered_scenario(scenario_id))
+
+
+def importable(scenario_id: str) -> str:
+    """Return the name by which another process finds a scenario: "module:id" if the module of a user has it.
+
+    Args:
+        scenario_id: Registered id, or already "module:id".
+
+    Raises:
+        InputError: The scenario is defined in a notebook or script, which other processes cannot import.
+    """
+    if ":" in scenario_id:
+        return scenario_id
+    module = gymnasium.registry[scenario_id].kwargs["scenario"].partition(":")[0]
+    if module == "__main__":
+        raise InputError(f"{scenario_id} is defined in a notebook or script: put it into a module.")
+    return scenario_id if module.startswith("clbench.envs.") else f"{module}:{scenario_id}"
 
 
 def registered_scenario(scenario_id: str) -> Scenario:

@@ -10,10 +10,10 @@ from typing import Literal, get_args
 
 from clbench.base.dependencies import require_packages
 from clbench.base.entry_points import resolve, unknown
-from clbench.base.errors import InputError, UnknownNameError
-from clbench.base.text import html_table
+from clbench.base.errors import InputError, UnknownNameError, WrongTypeError
+from clbench.base.text import html_table, quoted
 from clbench.spec.budget import Budget
-from clbench.spec.fields import check_entry_point
+from clbench.spec.fields import check_entry_point, check_tuple
 from clbench.spec.limits import Limits
 from clbench.spec.policies import DEFAULT_POLICY, check_policy_name
 from clbench.spec.task import Task
@@ -61,6 +61,11 @@ class Scenario:
     """Name of the policy that is pretrained and fine-tuned, see `clbench.spec.policies`."""
 
     def __post_init__(self) -> None:
+        check_tuple(self, Task, "retained", "target", "held_out", "background", "scenes")
+        for name, kind in (("budget", Budget), ("limits", Limits)):
+            if not isinstance(getattr(self, name), kind):
+                value = quoted(repr(getattr(self, name)))
+                raise WrongTypeError(f"{name} of {self.id} must be a {kind.__name__}, not {value}.")
         names = [task.name for task in self.tasks + self.background]
         for name in names:
             if names.count(name) > 1:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from clbench.base.errors import InputError, WrongTypeError
+from clbench.base.errors import InputError
 from clbench.base.source import package_of
-from clbench.base.text import html_table
-from clbench.spec.fields import check_entry_point, check_share, check_whole
-from clbench.spec.identifiers import check_plain
+from clbench.base.text import html_table, quoted
+from clbench.spec.fields import check_entry_point, check_share, check_tuple, check_whole
 from clbench.spec.protocol import Split
+
+_NAME = re.compile(r"\w[\w-]*", re.ASCII)
+"""What Minari and Gymnasium allow in a part of an id."""
 
 
 @dataclass(frozen=True)
@@ -49,12 +52,12 @@ class Task:
     demonstrations and measurements would change with it."""
 
     def __post_init__(self) -> None:
-        check_plain("task", self.name)
-        for field in ("instructions", "test_instructions"):
-            if isinstance(getattr(self, field), str):
-                raise WrongTypeError(
-                    f"{field} of the task {self.name} must be a tuple of texts, not one text."
+        for field, value in (("name", self.name), ("suite", self.suite), ("seed_name", self.seed_suite)):
+            if not isinstance(value, str) or not _NAME.fullmatch(value):
+                raise InputError(
+                    f"{quoted(str(value))} cannot be the {field} of a task: letters, digits, _ and - only."
                 )
+        check_tuple(self, str, "instructions", "test_instructions", "packages")
         if not self.instructions or not all(
             words.strip() for words in self.instructions + self.test_instructions
         ):

@@ -167,7 +167,10 @@ def _play(task: Task, world: World, seed: int, act: Any) -> _Episode:
     for step in range(task.horizon + 1):
         where = f"task {task.name}, step {step}"
         if not world.observation_space.contains(state) or not np.isfinite(state).all():
-            raise ScenarioError(f"{where}: the state is not in {world.observation_space}, or not finite.")
+            kind = f"{getattr(state, 'dtype', type(state).__name__)} of shape {np.shape(state)}"
+            raise ScenarioError(
+                f"{where}: the state is not in {world.observation_space}, or not finite: it is {kind}."
+            )
         if bool(info.get("success", False)) != bool(done):
             raise ScenarioError(f'{where}: terminated is {done}, info["success"] is {info.get("success")}.')
         if done or step == task.horizon:

@@ -124,7 +124,7 @@ class ToyRun:
         data, pretrained = toy_data(policy)
         # no two runs begin with the same global generators: results that depend on them differ
         with deterministic(), seeded("toy run", next(_numbers)), tempfile.TemporaryDirectory() as folder:
-            self.trainer = Trainer(scenario, data, pretrained, self._watched_method, seed, 0)
+            self.trainer = Trainer(scenario, data, pretrained, self._watched_method, seed, pretraining_seed=0)
             self._go(Path(folder), resumed)
 
     def _go(self, folder: Path, resumed: bool) -> None:

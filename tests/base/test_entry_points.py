@@ -19,6 +19,7 @@ def test_an_entry_point_names_an_object() -> None:
         ("clbench.no.such:thing", "No module 'clbench.no'"),
         (":thing", "No module ''"),
         ("mine.py:Mine", "Did you mean 'mine:Mine'"),
+        ("./methods/mine.py:Mine", "Did you mean 'methods.mine:Mine'"),
     ],
 )
 def test_a_wrong_name_is_refused_with_the_nearest_one(name: str, message: str) -> None:

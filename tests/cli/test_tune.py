@@ -129,6 +129,15 @@ def test_a_setting_that_fails_is_not_chosen_and_a_method_that_always_fails_stops
     said = capsys.readouterr()
     assert f"Failed at every learning rate: {names[1]}." in said.err
     assert "me--Tiny-v0.json: copy mine.json there, on every machine" in " ".join(said.err.split())
+    there = tmp_path / "tuned.json"
+    there.write_bytes((tmp_path / "mine.json").read_bytes())
+    monkeypatch.setattr("clbench.runs.tuning.tuned_file", lambda _: there)
+    app(
+        ["tune", TINY, names[0], "--first-seed", "103", "--seeds", "1", "--write", "mine.json"],
+        result_action="return_value",
+    )
+    told = " ".join(capsys.readouterr().err.split())
+    assert f"repeat this command with --write {there}, which keeps its other methods, on" in told
     methods = json.loads((tmp_path / "mine.json").read_text())["methods"]
     assert list(methods) == names[:1]
     tried = methods[names[0]]["tried"]

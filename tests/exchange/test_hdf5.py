@@ -289,6 +289,12 @@ def test_what_does_not_fit_is_named(edit: Callable[[h5py.Group], None], message:
         read_hdf5(exported, TASK)
 
 
+def test_an_instruction_counts_as_a_policy_reads_it(exported: Path) -> None:
+    with h5py.File(exported, "r+") as file:
+        _attribute("problem_info", '{"language_instruction": "Go right!"}')(file["data"])
+    assert read_hdf5(exported, TASK)
+
+
 def test_the_datasets_of_the_state_are_named_with_the_nearest_one(libero: Path) -> None:
     with pytest.raises(InputError, match=r"data/demo_0 has no 'obs/ee_ps'\. Did you mean 'obs/ee_pos'\?"):
         read_hdf5(libero, TASK, ["obs/ee_ps"])

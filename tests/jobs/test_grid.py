@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import pytest
 from rich.console import Console
 
@@ -224,3 +225,39 @@ def test_a_job_of_this_process_ends_when_its_worker_is_closed() -> None:
     assert count > 0
     time.sleep(0.05)  # in which a job that still ran would go on
     assert len(reached) == count
+
+
+MINE = """
+import dataclasses
+
+import clbench
+from clbench.testing import TOY
+
+SCENARIO = dataclasses.replace(TOY, id="me/Imported-v0")
+clbench.register("me/Imported-v0", f"{__name__}:SCENARIO")
+"""
+
+
+@pytest.mark.long
+def test_other_processes_import_the_scenario_that_the_program_imported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(gymnasium.registry, "me/Imported-v0", raising=False)  # and after the test
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "imported_scenario.py").write_text(MINE, encoding="utf-8")
+    importlib.import_module("imported_scenario")
+    (record,) = clbench.run("me/Imported-v0", "frozen", seeds=1, records=tmp_path / "records")
+    assert (record.status, record.run.scenario) == ("success", "me/Imported-v0")
+
+
+def test_what_a_notebook_defines_is_refused_before_anything_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(gymnasium.registry, "me/Typed-v0", raising=False)  # and after the test
+    clbench.register("me/Typed-v0", "__main__:SCENARIO")
+    with pytest.raises(ValueError, match="me/Typed-v0 is defined in a notebook or script: put it"):
+        clbench.run("me/Typed-v0", "frozen", records=tmp_path)
+    with pytest.raises(ValueError, match="A policy must be in a module"):
+        clbench.run(TOY, "frozen", policy="__main__:Policy", records=tmp_path)
+    assert list(tmp_path.iterdir()) == []

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,12 @@ from tiny import TINY
 
 import clbench
 from clbench.base.cache import cache_folder
-from clbench.learning.watching import watches
+from clbench.base.progress import no_progress
+from clbench.learning.optimise import MethodError
+from clbench.learning.watching import watch, watches
+from clbench.policy.transformer import TransformerPolicy
 from clbench.testing import ContractError, check_method
+from clbench.testing.small import SMALL
 
 ID = f"tiny:{TINY.id}"
 """Processes that do the runs import the module of the scenario."""
@@ -98,6 +103,17 @@ def test_a_method_sees_every_step_and_pays_for_it(
 def test_only_a_method_that_overrides_the_hook_watches() -> None:
     assert watches(Careful)
     assert not watches(clbench.load_method("sft"))
+
+
+class Downloaded(TransformerPolicy):
+    """A new one has pretrained weights of its own."""
+
+    pretrained = True
+
+
+def test_there_is_nothing_to_watch_where_a_policy_has_pretrained_weights_of_its_own() -> None:
+    with pytest.raises(MethodError, match="nothing to watch: Downloaded has pretrained weights of its own"):
+        watch(Careful(), Downloaded(SMALL), TINY, 0, nullcontext, no_progress)
 
 
 @pytest.mark.slow

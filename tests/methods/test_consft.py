@@ -116,7 +116,7 @@ def test_of_a_stage_to_a_criterion_the_schedule_is_as_long_as_plain_fine_tuning_
 ) -> None:
     method: Any = build_method("consft", {"step_factor": factor, "schedule": schedule})
     for step in (0, 5, 11, 47, 60):
-        # 7.5 steps are lost in the warm-up, and the step factors then add up to 4
+        # of the 15 steps of the warm-up about half are lost, and the step factors then add up to about 4
         weight = _omega(1e-4, step / length, omega_min=0.0)
         tau = -25.0 * 1e-4 / math.log(weight)
         assert method.temperature(Progress(step, 1000, True)) == pytest.approx(tau, rel=1e-4)
@@ -227,6 +227,19 @@ def test_the_histogram_counts_the_weights() -> None:
     assert len([count for count in expected if count]) > 1
     assert diagnostics["omega_counts"][7] == expected
     assert not np.any(np.delete(diagnostics["omega_counts"], 7, axis=0))
+
+
+class Rounded(TransformerPolicy):
+    """Has a loss of another type than the bins."""
+
+    def action_loss(self, batch: Batch, hidden: list[Tensor] | None = None) -> Tensor:
+        return super().action_loss(batch, hidden).bfloat16()
+
+
+def test_the_histogram_counts_the_weights_of_a_policy_with_half_precision() -> None:
+    method = _started("consft")
+    method.loss(Rounded(SMALL), toy_source("right").sample(8), Progress(0, 10))
+    assert np.sum(method.diagnostics()["omega_counts"]) == 8
 
 
 def test_the_calibrated_variant_and_the_controls_change_only_the_unit_of_the_loss() -> None:

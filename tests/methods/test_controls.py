@@ -103,6 +103,7 @@ def test_the_teacher_of_lwf_does_not_learn() -> None:
     _adapt(policy, method)
     assert not policy.get_parameter("head.embed.weight").equal(before["head.embed.weight"])
     assert all(weight.equal(before[name]) for name, weight in method.teacher.named_parameters())
+    assert not method.teacher.training  # or its dropout would draw, and its batch norm would learn
 
 
 def test_the_gradient_of_lwf_sums_both_terms() -> None:

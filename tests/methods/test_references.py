@@ -4,6 +4,7 @@ import pytest
 import torch
 from helpers import build_method
 
+from clbench.base.errors import InputError
 from clbench.learning.adaptation import adapt
 from clbench.learning.method import Progress, Stage
 from clbench.learning.prior import Nothing, Prior, Source, Uses
@@ -77,6 +78,18 @@ def test_every_target_starts_from_new_weights_and_the_known_normalisation() -> N
                 parameter.add_(1.0)
     assert known
     assert all(value.equal(known[name]) for name, value in policy.named_buffers())
+
+
+class Downloaded(TransformerPolicy):
+    """A new one has pretrained weights of its own."""
+
+    pretrained = True
+
+
+def test_a_policy_with_pretrained_weights_of_its_own_has_no_row_from_scratch() -> None:
+    stage = Stage(1, TOY.task("right"), 11, 3, toy_source("right"), Prior({}))
+    with pytest.raises(InputError, match="needs untrained weights, and a new Downloaded has pretrained ones"):
+        build_method("from_scratch", {}).start_task(Downloaded(SMALL), stage)
 
 
 def test_from_scratch_is_plain_fine_tuning_of_a_new_policy() -> None:

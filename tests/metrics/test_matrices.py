@@ -172,6 +172,14 @@ def test_the_gain_counts_in_no_flip_since_it_repeats_the_final_average() -> None
     assert flip.first_is_better == ("final_average",)
 
 
+def test_a_method_may_be_named_by_a_number() -> None:
+    numbered: Any = {0: TRIANGLE, 1: TRIANGLE}
+    report = from_matrix(numbered)
+    assert report.of("final_average", 1) == report.of("final_average", "1")  # type: ignore[arg-type]
+    with pytest.raises(UnknownNameError, match="'2'"):
+        report.of("final_average", 2)  # type: ignore[arg-type]
+
+
 def test_a_tie_is_no_flip() -> None:
     assert from_matrix({"one": TRIANGLE, "other": TRIANGLE}).flips == ()
 

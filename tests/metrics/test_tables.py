@@ -109,6 +109,13 @@ def test_a_number_with_an_underscore_is_no_rate(table: Path) -> None:
         from_csv(table)
 
 
+def test_stages_that_pandas_wrote_as_floats_are_whole_numbers(table: Path) -> None:
+    table.write_text("stage,reach,push\n1.0,0.5,0.5\n2.0,0.5,0.5\n", encoding="utf-8")
+    floats = from_csv(table)
+    table.write_text("stage,reach,push\n1,0.5,0.5\n2,0.5,0.5\n", encoding="utf-8")
+    assert floats["final_average"] == from_csv(table)["final_average"]
+
+
 def test_the_notes_of_a_table_are_its_lines_that_begin_with_a_hash(table: Path) -> None:
     table.write_text(WIDE, encoding="utf-8")
     assert notes(table) == ["where it comes from"]

@@ -99,7 +99,7 @@ def test_the_prediction_is_the_mean_action_over_the_bins_at_the_masked_chunk() -
     np.testing.assert_allclose(found, expected.reshape(6, CONFIG.chunk, 3), rtol=1e-4, atol=1e-5)
 
 
-def test_the_loss_does_not_see_tokens_that_are_masked_or_do_not_count() -> None:
+def test_the_loss_does_not_see_tokens_that_do_not_count() -> None:
     policy, batch = TransformerPolicy(CONFIG), batch_of(4)
     other = batch.action.clone()
     other[0, 3:] = 0.7

@@ -53,10 +53,15 @@ def test_the_same_batch_gives_the_same_loss_and_the_same_seed_the_same_weights()
     assert not first.equal(other)
 
 
-def test_making_a_policy_leaves_the_global_generator_alone() -> None:
+def test_making_a_policy_leaves_the_global_generators_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds: list[int] = []  # of GPUs
+    monkeypatch.setattr("torch.cuda.manual_seed_all", seeds.append)
     before = torch.get_rng_state()
     TransformerPolicy(CONFIG, seed=3)
     assert torch.get_rng_state().equal(before)
+    assert seeds == []
+    torch.manual_seed(3)
+    assert seeds == [3]
 
 
 def test_the_flow_loss_is_the_squared_error_of_the_velocity_at_the_drawn_time() -> None:

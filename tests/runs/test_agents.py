@@ -271,7 +271,8 @@ def test_the_parameters_of_a_network_that_grows_are_those_at_the_end(evaluate: C
         (lambda _: [1.0, 2.0, 3.0], ValueError, r"action has the shape \(3,\), not \(2,\)"),
         (lambda _: [[1.0, 2.0]], ValueError, r"action has the shape \(1, 2\), not \(2,\)"),
         (lambda _: None, ValueError, r"action has the shape \(\), not \(2,\)"),
-        (lambda _: {"arm": 1}, ValueError, "must be 2 numbers, not a dict"),
+        (lambda _: {"arm": 1}, ValueError, r"must be 2 numbers, not a dict \(.+\)"),
+        (lambda _: torch.zeros(2).bfloat16(), ValueError, r"2 numbers, not a Tensor \(.*BFloat16\)"),
         (lambda _: "left", ValueError, "must be 2 numbers, not a str"),
         (3, TypeError, "int is not an agent"),
     ],
@@ -282,6 +283,13 @@ def test_an_agent_that_cannot_act_is_refused_and_the_stage_can_be_evaluated_agai
     with pytest.raises(error, match=message):
         evaluate(agent, stage_env(0))
     evaluate(Knowing(), stage_env(0))
+
+
+def test_a_stage_may_be_a_number_of_numpy(evaluate: Callable[..., Any]) -> None:
+    for stage in np.arange(2):
+        evaluate(Knowing(), gymnasium.make(ID, stage=stage))
+    with pytest.raises(ValueError, match=r"Stage 2 of .* comes next, not 1"):
+        evaluate(Knowing(), gymnasium.make_vec(ID, num_envs=2, stage=np.int64(1)))
 
 
 def test_a_prediction_without_a_state_is_refused(evaluate: Callable[..., Any]) -> None:

@@ -163,6 +163,21 @@ def test_a_run_killed_without_keeping_its_policies_keeps_them_all_if_it_goes_on_
     assert has_stages(spec.resolve(), tmp_path)
 
 
+@pytest.mark.long
+def test_a_run_that_goes_on_keeps_no_policy_of_older_code(
+    tmp_path: Path, execute_and_kill: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = RunSpec(TINY.id, "sft", seed=0)
+    with monkeypatch.context() as older:
+        older.setattr(Method, "loss", lambda _, policy, batch, __: 0.0 * policy.action_loss(batch).mean())
+        execute(spec, tmp_path, checkpoints=tmp_path)
+    spec.path(tmp_path).unlink()
+    assert has_stages(spec.resolve(), tmp_path)
+    execute_and_kill(spec, tmp_path, 0.75)
+    execute(spec, tmp_path, checkpoints=tmp_path)
+    _assert_equal(stage_policies(spec.resolve(), tmp_path), stage_policies(spec.resolve()))
+
+
 def test_policies_kept_by_another_version_of_the_code_are_replaced(kept: Path, tmp_path: Path) -> None:
     stale = tmp_path / "me--Tiny-v0" / "lora" / "seed-0" / "stage-2"
     stale.mkdir(parents=True)

@@ -50,6 +50,16 @@ def test_a_tuning_run_and_a_test_run_share_no_evaluation(
 
 
 @pytest.mark.long
+def test_a_processor_that_computes_otherwise_evaluates_for_itself(
+    tmp_path: Path, reports: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for instructions in ("AVX2", "AVX512"):
+        monkeypatch.setattr("torch.backends.cpu.get_cpu_capability", lambda name=instructions: name)
+        execute(RunSpec(TINY.id, "frozen", seed=0), tmp_path / instructions)
+    assert len(list(reports.iterdir())) == 2
+
+
+@pytest.mark.long
 def test_the_pretrained_policy_is_evaluated_once(tmp_path: Path, reports: Path) -> None:
     first = execute(RunSpec(TINY.id, "sft", seed=0), tmp_path)
     (folder,) = reports.iterdir()

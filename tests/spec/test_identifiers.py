@@ -25,7 +25,16 @@ def test_our_own_names_are_allowed_and_not_alike() -> None:
 
 @pytest.mark.parametrize(
     "method",
-    ["theirs/sft", "their-lab/my_method", "lab.tools/v2-x", "mine:Gentle", "a.b_c.d:SFT", "Better", "sft_2"],
+    [
+        "theirs/sft",
+        "their-lab/my_method",
+        "lab.tools/v2-x",
+        "me/pi0.5",
+        "mine:Gentle",
+        "a.b_c.d:SFT",
+        "Better",
+        "sft_2",
+    ],
 )
 def test_names_of_strangers_are_allowed(method: str) -> None:
     check_method_name(method)

@@ -120,7 +120,11 @@ def _lambda(state: object) -> object:
         ({"instructions": ()}, ValueError, "task right needs an instruction"),
         ({"instructions": ("go right", " ")}, ValueError, "none of them may be empty"),
         ({"instructions": "go right"}, TypeError, "must be a tuple of texts, not one text"),
+        ({"instructions": ["go right"]}, TypeError, r"must be a tuple of texts, not \"\['go right'\]\""),
+        ({"packages": "mujoco"}, TypeError, r"packages of right must be a tuple of texts, .* is \(one,\)"),
         ({"name": "../right"}, ValueError, "cannot be the name of a task"),
+        ({"name": "v2.right"}, ValueError, "cannot be the name of a task: letters, digits, _ and - only"),
+        ({"suite": "me/table"}, ValueError, "'me/table' cannot be the suite of a task"),
     ],
 )
 def test_an_impossible_task_is_refused_where_it_is_built(
@@ -136,6 +140,30 @@ def test_a_scenario_that_has_nothing_to_ask_about_is_refused_where_it_is_built()
     assert dataclasses.replace(TOY, retained=(), scenes=TOY.target).scene_tasks == TOY.target
     with pytest.raises(TypeError, match="questions of clbench/Toy-v0 must be a string 'module:name'"):
         dataclasses.replace(TOY, questions=None)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"retained": list(TOY.retained)},
+            r"retained of clbench/Toy-v0 must be a tuple of Tasks, not .\[<Task",
+        ),
+        (
+            {"held_out": TOY.held_out[0]},
+            r"must be a tuple of Tasks, not one Task; a tuple of one is \(one,\)",
+        ),
+        (
+            {"budget": {"demonstrations": 3}},
+            "budget of clbench/Toy-v0 must be a Budget, not .{'demonstrations': 3}",
+        ),
+    ],
+)
+def test_a_scenario_of_other_parts_is_refused_where_it_is_built(
+    changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(TypeError, match=message):
+        dataclasses.replace(TOY, **changes)
 
 
 def test_two_tasks_of_one_name_are_refused_where_the_scenario_is_built() -> None:

@@ -1,0 +1,38 @@
+"""`score` in Python: what it refuses before an episode is played."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from agents import ID
+
+from clbench.serving.score import score
+
+
+def _still(observations: dict[str, Any]) -> Any:
+    return np.zeros((40, 2, 2))
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"executed": 0}, ValueError, "executed must be a whole number from 1, not 0"),
+        ({"executed": -1}, ValueError, "executed must be a whole number from 1, not -1"),
+        ({"steps": -5.5}, ValueError, "steps must be a whole number from 0, not -5.5"),
+        ({"steps": True}, ValueError, "steps must be a whole number from 0, not True"),
+        ({"data": ["a", 1]}, TypeError, r"data must be words, not \['a', 1\]"),
+    ],
+)
+def test_what_a_record_cannot_mean_is_refused(
+    options: dict[str, Any], error: type[Exception], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(error, match=message):
+        score(ID, _still, stage=0, method="me/still", records=tmp_path, **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_numbers_of_numpy_are_recorded_as_numbers(tmp_path: Path) -> None:
+    numbers: Any = {"executed": np.int64(2), "steps": np.int64(5)}
+    record = score(ID, _still, stage=0, method="me/still", records=tmp_path, **numbers)
+    assert (record.run.settings, record.diagnostics["0"]["steps"]) == ({"executed": 2}, 5)
