@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from functools import cached_property
+from itertools import chain, groupby
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -24,7 +26,7 @@ from clbench.scoring.reading import (
     read_protocol,
     read_relearning,
 )
-from clbench.spec.protocol import Protocol
+from clbench.spec.protocol import Point, Protocol
 
 WEAK = 0.8
 """Success of the pretrained policy on the retained skills below which there is little to forget."""
@@ -117,10 +119,15 @@ class Scores(Measured):
                 episodes). They add up to the number of episodes. If None, each episode is drawn once,
                 without batch axes.
         """
-        layout, number = self.layout, len(self.layout.episodes)
-        if counts is None:
-            counts = np.ones((len(layout.tasks), number))
-        batch = counts.shape[:-2]
+        return self._plain_rates if counts is None else self._rates(counts)
+
+    @cached_property
+    def _plain_rates(self) -> Rates:
+        """The rates that every comparison of the run needs again: a board asks for them 50 times."""
+        return self._rates(np.ones((len(self.layout.tasks), len(self.layout.episodes))))
+
+    def _rates(self, counts: Array) -> Rates:
+        layout, number, batch = self.layout, len(self.layout.episodes), counts.shape[:-2]
 
         def spread(array: Array) -> Array:
             return np.broadcast_to(array, batch + array.shape)
@@ -149,8 +156,8 @@ class Scores(Measured):
 
 def _chosen_on(rows: Sequence[EpisodeRow], protocol: Protocol) -> list[EpisodeRow]:
     """Return the validation episodes of each stage's target, which choices may look at."""
-    own = [row for row in rows if row.split == "validation" and row.point.stage > 0]
-    return [row for row in own if row.task == protocol.target[row.point.stage - 1]]
+    own = [row for row in rows if row.split == "validation" and row.stage > 0]
+    return [row for row in own if row.task == protocol.target[row.stage - 1]]
 
 
 def _sums(values: Array, counts: Array) -> Array:
@@ -180,9 +187,10 @@ def _success(protocol: Protocol, rows: Sequence[EpisodeRow], layout: Layout) -> 
     shape = len(protocol.stages), len(protocol.steps), len(layout.tasks), len(layout.episodes)
     found = np.full(shape, np.nan)
     of_task, of_episode = _places(layout.tasks), _places(layout.episodes)
-    for row in rows:
-        where = row.point.stage, place(protocol, row.point), of_task[row.task], of_episode[row.episode]
-        found[where] = row.success
+    for (stage, step), at_point in groupby(rows, key=attrgetter("stage", "step")):
+        there = found[stage, place(protocol, Point(stage, step))]
+        for row in at_point:
+            there[of_task[row.task], of_episode[row.episode]] = row.success
     return found
 
 

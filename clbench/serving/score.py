@@ -119,6 +119,7 @@ def score(
         WrongTypeError: `data` is no text.
     """
     executed, steps = _whole("executed", executed, 1), _whole("steps", steps, 0)
+    stage = int(stage) if is_whole(stage) else stage  # of NumPy, which JSON cannot hold
     if data is not None and not isinstance(data, str):
         raise WrongTypeError(f"data must be words, not {data!r}.")
     run = StagedRun(load_scenario(scenario), method, seed, Path(records), EXTERNAL_USES)

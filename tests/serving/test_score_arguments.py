@@ -33,6 +33,6 @@ def test_what_a_record_cannot_mean_is_refused(
 
 
 def test_numbers_of_numpy_are_recorded_as_numbers(tmp_path: Path) -> None:
-    numbers: Any = {"executed": np.int64(2), "steps": np.int64(5)}
-    record = score(ID, _still, stage=0, method="me/still", records=tmp_path, **numbers)
+    numbers: Any = {"stage": np.int64(0), "executed": np.int64(2), "steps": np.int64(5)}
+    record = score(ID, _still, method="me/still", records=tmp_path, **numbers)
     assert (record.run.settings, record.diagnostics["0"]["steps"]) == ({"executed": 2}, 5)
