@@ -1,9 +1,10 @@
 """Perturbations: the changes to the world in a perturbed episode.
 
 A perturbed episode has the seed, the instruction and the policy's draws of the test episode of its number.
-Only the start pose, the mass of the moved object and, where a policy sees pictures, camera and light differ.
-They follow from that seed alone, in their own random stream: all other draws of the episode stay the same.
-Each suite gives the scale of a displaced start, and each camera the scale of its view, with reasons.
+Only the start (its pose, or on dm_control its speeds), the masses of objects and, where a policy sees
+pictures, camera and light differ. They follow from that seed alone, in their own random stream: all other
+draws of the episode stay the same. Each suite gives the scale of a displaced start, and each camera the scale
+of its view, with reasons.
 """
 
 from __future__ import annotations

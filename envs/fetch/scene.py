@@ -21,7 +21,7 @@ with contextlib.redirect_stderr(io.StringIO()):
     from gymnasium_robotics.utils.rotations import mat2euler
 
 CAMERA = {"distance": 1.2, "azimuth": 60.0, "elevation": -25.0, "lookat": np.array([1.3, 0.75, 0.56])}
-"""A view from the right behind the robot: left is left, away goes right, small pictures show the block."""
+"""A view from the right beside the robot: left is left, away goes right, small pictures show the block."""
 
 __all__ = ["CAMERA", "Scene", "mat2euler", "scene", "scene_file", "scene_with_mass"]
 

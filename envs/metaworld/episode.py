@@ -92,6 +92,12 @@ class Episode(SawyerXYZEnv):
             self.model = self.scene.model
             self.scene.models.give_back(taken)
 
+    def complete(self) -> None:
+        """Compute what a picture needs beyond a step; no other thread steps in the model meanwhile."""
+        with self._own_model() as model:
+            self.place()
+            mujoco.mj_forward(model, self.data)
+
     def place(self) -> None:
         """Set the places of bodies and sites in the model to this episode's."""
         self.model.body_pos[:], self.model.site_pos[:] = self._places

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, TypeAlias
 
 import gymnasium
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -137,8 +136,7 @@ class MetaWorldVectorWorld:
     def drawable(self, lane: int) -> Drawable:
         """Return the scene of a lane with the objects in place; the next step is independent of this call."""
         episode = self._lane(lane).episode
-        episode.place()
-        mujoco.mj_forward(episode.model, episode.data)  # a picture needs more than a step computes
+        episode.complete()
         return Drawable(episode.model, episode.data, CAMERA)
 
     def close(self) -> None:

@@ -17,7 +17,7 @@ from clbench.worlds.threads import Copies
 Vector = NDArray[np.float64]
 
 CAMERA = {"distance": 1.4, "azimuth": 135.0, "elevation": -30.0, "lookat": np.array([0.0, 0.6, 0.15])}
-"""A view from the front left, above the table."""
+"""A view from the right behind the robot, above the table."""
 
 
 @dataclass(frozen=True)

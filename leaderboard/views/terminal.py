@@ -12,6 +12,7 @@ from rich.measure import Measurement
 from rich.table import Table as TextTable
 from rich.text import Text
 
+from clbench.base.text import listed
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metrics import METRICS
 
@@ -34,7 +35,8 @@ from .format import (
 LEGEND = (
     "Rows of a division that share a letter are not told apart. "
     "± is half the width of a 95 % confidence interval; it does not cover what all seeds share: "
-    "demonstrations, scenes and questions. Higher is better{lower}. {tried}"
+    "demonstrations, scenes and questions. Higher is better, except for {lower}. {tried}"
+    "Bold: the best value of a division. "
     "Cost: relative cost, the training time divided by sft's. Tier: {tiers}.\n"
 )
 """Legend below the tables."""
@@ -104,11 +106,10 @@ def terminal(table: Summary, width: int = 108, sort: str | None = None) -> Rende
         parts += [*_fitted("All scenarios", over_scenarios, _overall_heads(over_scenarios), width), Text()]
     if parts:
         heads = [one for rows in tables for one in fitting(rows) if one.metric.higher_is_better is False]
-        names = ", ".join(dict.fromkeys(one.title for one in heads))
-        lower = f", except for {names}" if names else ""
+        names = listed([*dict.fromkeys(one.title for one in heads), "cost", "bytes kept"])
         tried = TRIED if any(row.to_criterion for row in table.rows) else ""
         tiers = ", ".join(f"{number} {tier}" for number, tier in enumerate(TIERS))
-        parts.append(Text(LEGEND.format(lower=lower, tried=tried, tiers=tiers)))
+        parts.append(Text(LEGEND.format(lower=names, tried=tried, tiers=tiers)))
     if table.not_shown:
         parts.append(Text("Not shown", style="bold"))
         parts += [Text(f"  {entry}", overflow="fold") for entry in table.not_shown]
@@ -147,6 +148,11 @@ def _width(table: TextTable) -> int:
     return Measurement.get(console, console.options, table).maximum
 
 
+def _is_best(value: float | None, best: float | None) -> bool:
+    """Return whether a value is the best one: equal ones may differ in the last bit."""
+    return value is not None and best is not None and abs(value - best) < 1e-9
+
+
 def _table(
     title: str,
     rows: Sequence[RowSummary | OverallRow],
@@ -168,7 +174,7 @@ def _table(
         best = [_best(head, members) for head in heads]
         for row in members:
             cells = [
-                Text(head.cell(row), style="bold" if top is not None and head.value(row) == top else "")
+                Text(head.cell(row), style="bold" if _is_best(head.value(row), top) else "")
                 for head, top in zip(heads, best, strict=True)
             ]
             table.add_row(Text(_letters(row, members)), Text(row.method), *cells)
@@ -194,7 +200,7 @@ def _heads(rows: list[RowSummary]) -> list[_Head]:
         _Head("seeds", lambda row: str(len(row.seeds))),
         *_metric_heads(rows),
         *tried,
-        _Head("cost", lambda row: number_text(row.costs["relative_cost"], ".1f")),
+        _Head("cost", lambda row: number_text(row.costs["relative_cost"], ".2f")),
         _Head("bytes kept", _size),
         _Head("tier", lambda row: str(TIERS.index(row.tier))),
     ]

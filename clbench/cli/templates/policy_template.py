@@ -26,7 +26,7 @@ class PolicyTemplate(Policy):
         super().__init__(config, seed)
         actions = config.chunk * config.action_size
         with torch.random.fork_rng(devices=[]):  # the global generator stays as it is
-            torch.default_generator.manual_seed(seed)  # `torch.manual_seed` would also seed every GPU
+            torch.default_generator.manual_seed(seed)  # of the CPU alone
             self.words = nn.EmbeddingBag(config.vocabulary_size, WIDTH, padding_idx=0)
             self.read = nn.Linear(config.state_size + actions + 2, WIDTH)
             # LoRA adapts the linear maps inside modules that are called `layers`

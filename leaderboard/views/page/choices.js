@@ -6,10 +6,16 @@ const choices = (() => {
   const nameOf = (field) => (field.name === "division" ? `division ${field.value}` : field.name);
   const titleOf = (head) => head.querySelector("button").firstChild.data.trim();
 
+  /* The place that the address names, and the choices behind it. */
+  function address() {
+    const [place, query = ""] = location.hash.slice(1).split("?");
+    try { return [decodeURIComponent(place), query]; } catch { return ["", ""]; /* "%" alone is no text */ }
+  }
+
   /* Set the fields of a part as the address says, otherwise to their defaults, whatever the browser has restored.
      Return the head of the column that the address sorts by, and the direction. */
   function read(part, heads) {
-    const [place, query] = location.hash.slice(1).split("?");
+    const [place, query] = address();
     const chosen = new URLSearchParams(place === part.id ? query : "");
     for (const field of fields(part)) {
       const text = chosen.get(nameOf(field));
@@ -35,5 +41,5 @@ const choices = (() => {
     history.replaceState(history.state, "", `#${[part.id, String(chosen)].filter(Boolean).join("?")}`);
   }
 
-  return { read, keep };
+  return { address, read, keep };
 })();

@@ -10,7 +10,7 @@
 
   /* The part or row that the address names. */
   function place() {
-    try { return decodeURIComponent(location.hash.slice(1).split("?")[0]); } catch { return ""; /* "%" alone is no text */ }
+    return choices.address()[0];
   }
 
   /* Make the elements of a part from its text, in which the templates escaped what strangers wrote. */
@@ -110,9 +110,15 @@
       .filter((row) => row.checkVisibility())
       .map((row) => [...row.querySelectorAll(NOTED)].filter((cell) => cell.checkVisibility()))
       .filter((row) => row.length);
+    /* What hides a number may have hidden the one where the Tab key stops. */
+    table.stop = () => {
+      const shown = cells().flat();
+      if (shown.some((cell) => cell.tabIndex === 0)) return;
+      for (const cell of table.querySelectorAll(NOTED)) cell.tabIndex = -1;
+      if (shown.length) shown[0].tabIndex = 0;
+    };
     for (const cell of table.querySelectorAll(NOTED)) cell.tabIndex = -1;
-    const first = cells()[0]?.[0];
-    if (first) first.tabIndex = 0;
+    table.stop();
     table.addEventListener("keydown", (event) => {
       const step = { ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowUp: [-1, 0], ArrowDown: [1, 0] }[event.key];
       const here = event.target.closest(NOTED);
@@ -137,10 +143,15 @@
     const form = part.querySelector(".filters");
     const [all, grouped] = part.querySelectorAll(".choices input");
     const usual = heads.find((head) => head.ariaSort !== "none"), first = usual.ariaSort;
-    const [wanted, order] = choices.read(part, heads);
-    let column = heads.indexOf(wanted ?? usual);
-    let direction = wanted && ["ascending", "descending"].includes(order) ? order : heads[column].ariaSort;
-    if (direction === "none") direction = wanted.querySelector("button").dataset.first;
+    let column, direction;
+
+    /* Take the choices from the address. */
+    function take() {
+      const [wanted, order] = choices.read(part, heads), head = wanted ?? usual;
+      const usually = head === usual ? first : head.querySelector("button").dataset.first;
+      column = heads.indexOf(head);
+      direction = wanted && ["ascending", "descending"].includes(order) ? order : usually;
+    }
 
     function compare(a, b) {
       const [x, y] = [a, b].map(({ row }) => row.cells[column].dataset.order);
@@ -154,6 +165,7 @@
       table.parentElement.classList.toggle("all", all.checked);
       for (const one of [...rows].sort(compare)) (grouped.checked ? one.body : bodies[0]).append(one.row);
       heads.forEach((head, number) => { head.ariaSort = number === column ? direction : "none"; });
+      table.stop?.();
     }
 
     function filter() {
@@ -169,6 +181,7 @@
       }
       for (const body of bodies) body.rows[0].hidden = rows.every((one) => one.body !== body || one.row.hidden);
       form.elements.count.value = `${methods.size} of ${rows.length} ${rows.length === 1 ? "method" : "methods"}`;
+      table.stop?.();
       return methods;
     }
 
@@ -195,6 +208,8 @@
       clearTimeout(waiting);
       waiting = setTimeout(part.picture, 150); // a drawing for each letter would hold up the next one
     });
+    part.take = () => { take(); arrange(); part.picture(); };
+    take();
     if (location.hash.includes("?")) arrange(); // the rows come in the usual order
     roam(table);
   }
@@ -263,13 +278,14 @@
   /* Draw the charts of a part that have two sizes. */
   function drawOthers(part) {
     const size = narrow() ? "narrow" : "wide";
+    part.isNarrow = narrow();
     for (const name of ["frontier", "decoders"]) {
       for (const one of part.querySelectorAll(`[data-${name}]`)) draw(one, data.scenarios[part.id][`${size}_${name}`]);
     }
   }
 
-  const words = ([value, low, high]) =>
-    value === null ? "–" : value.toFixed(2) + (low === null ? "" : ` [${low.toFixed(2)}, ${high.toFixed(2)}]`);
+  const text = (value) => (value === null ? "–" : value.toFixed(2).replace(/^-(0\.00)$/, "$1"));
+  const words = ([value, low, high]) => text(value) + (low === null ? "" : ` [${text(low)}, ${text(high)}]`);
 
   /* The evaluations of a run in order: stage and step of each point of the curves of old skills and targets. */
   function places({ steps, targets }) {
@@ -342,10 +358,9 @@
       return table("The curves", ["target", "step", "success on the target", "on the old skills"], rows);
     },
     metrics(row) {
-      const rows = row.metrics.map(([value, low, high, ...each], index) => {
+      const rows = row.metrics.map((texts, index) => {
         const [name, description, missing] = data.scenarios[row.scenario].metrics[index];
-        const texts = [name, words([value, low, high]), ...each.map((one) => words([one, null, null]))];
-        return { texts, meaning: value === null ? `Missing: ${missing}` : description };
+        return { texts: [name, ...texts], meaning: texts[0] === "–" ? `Missing: ${missing}` : description };
       });
       const heads = ["metric", "value [95 % interval]", ...Object.keys(row.seeds).map((seed) => `seed ${seed}`)];
       return table("All other metrics and definitions", heads, rows);
@@ -391,7 +406,7 @@
     const seed = data.rows[opened].seeds[chosen.dataset.seed];
     if (seed) [...body.rows].forEach((row, stage) => [...row.cells].slice(1).forEach((cell, task) => {
       const value = seed[stage][task];
-      cell.textContent = value === null ? "–" : value.toFixed(2);
+      cell.firstChild.data = text(value);
       cell.className = cell.className.replace(/^\S+/, value === null ? "none" : `s${Math.round(value * 20)}`);
     }));
     for (const other of chosen.parentElement.children) other.ariaPressed = String(other === chosen);
@@ -428,8 +443,12 @@
     const part = openPart(), name = place(), isRow = Object.hasOwn(data.rows, name);
     const tab = tabs.querySelector("[aria-current]")?.textContent;
     document.title = [isRow && name.slice(part.id.length + 1), tab, title].filter(Boolean).join(" · ");
+    const isNew = part && !part.shown;
     if (part) show(part);
-    if (part && name === part.id) part.keep?.();
+    if (part && name === part.id) {
+      if (!isNew && location.hash.includes("?")) part.take?.();
+      part.keep?.();
+    }
     if (isRow) return openRow(name);
     if (dialog.open) { stay(); dialog.close(); }
   }
@@ -457,7 +476,10 @@
   window.addEventListener("popstate", go);
   window.addEventListener("resize", () => {
     measureTabs();
-    for (const part of parts) if (part.picture && part.size !== sizeOfPlane()) part.picture();
+    for (const part of parts) {
+      if (part.picture && part.size !== sizeOfPlane()) part.picture();
+      if (part.shown && part.isNarrow !== narrow()) drawOthers(part);
+    }
   });
   // An entry of the history that this page made for a row is "followed": closing the row leads back.
   if (!history.state) history.replaceState("landed", "");

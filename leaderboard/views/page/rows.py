@@ -255,13 +255,23 @@ def _drawn(
         "seeds": {seed: [list(map(rounded, line)) for line in lines] for seed, lines in success.items()},
         "elsewhere": row.division in ELSEWHERE,
         "metrics": [
-            [*_triple(row.estimates[metric.name]), *map(rounded, seeds[metric.name])] for metric in metrics
+            [
+                _words(row.estimates[metric.name]),
+                *(number_text(value, ".2f", MISSING) for value in seeds[metric.name]),
+            ]
+            for metric in metrics
         ],
     }
 
 
+def _words(one: Estimate) -> str:
+    return MISSING if one.value is None else format_interval(one)
+
+
 def _triple(one: Estimate) -> list[float | None]:
-    return [rounded(value) for value in (one.value, one.low, one.high)]
+    """Return a value with its ends; the page writes them, so they are not rounded to what a chart needs."""
+    ends = map(finite, (one.value, one.low, one.high))
+    return [None if end is None else round(end, 9) + 0.0 for end in ends]
 
 
 def _metric(column: Column, one: Estimate, seeds: Sequence[float | None]) -> MetricView:

@@ -22,7 +22,7 @@ from ...board.summary import (
     divisions_of,
 )
 from ..descriptions import RULES
-from ..format import format_interval, number_text
+from ..format import format_interval, number_text, rate_text
 from .numbers import MISSING, cost, size
 
 NAMED = 3
@@ -187,8 +187,8 @@ def _doubt(leader: Row, rows: Sequence[Row], apart: Container[str], tied: Sequen
     if not unsure:
         return ""
     return (
-        f"Tuning rated sft as highly at {number_text(unsure[0].factor, 'g')} times the learning rate; over "
-        f"that setting, the gain is {format_interval(unsure[0].gain)} and not certain."
+        f"Tuning rated sft as highly at {rate_text(unsure[0].factor)}; over that setting, the gain is "
+        f"{format_interval(unsure[0].gain, '+.2f')} and not certain."
     )
 
 

@@ -53,7 +53,12 @@ class Quantity:
 
 LEARNED = Quantity("learned", "adaptation", "success on each new task right after learning it")
 COST = Quantity("relative cost", "relative_cost", "training time divided by sft's", is_cost=True)
-BYTES = Quantity("bytes kept", "bytes_kept", "data passed from stage to stage", is_cost=True)
+BYTES = Quantity(
+    "bytes kept",
+    "bytes_kept",
+    "data, weights or statistics passed between stages",
+    is_cost=True,
+)
 KEPT = Quantity("kept", "kept", "success at the end on everything known before the last task")
 SKILLS = Quantity("kept skills", "retention", "success on the old skills at the end")
 TARGETS = Quantity("kept targets", "kept_targets", "success at the end on the new tasks before the last")

@@ -26,6 +26,7 @@ from clbench.records.writer import write_record
 page = resolve("clbench.leaderboard.views.page:page")
 pictures = resolve("clbench.leaderboard.views.page:pictures")
 markdown = resolve("clbench.leaderboard.views.markdown:markdown")
+format_interval = resolve("clbench.leaderboard.views.format:format_interval")
 tiers = importlib.import_module("clbench.leaderboard.board.tiers")
 compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 
@@ -82,7 +83,29 @@ def test_the_page_is_valid_and_has_a_row_and_a_section_for_each_method(records: 
         assert f"clbench run clbench/Toy-v0 {method} --seeds 2" in own
         assert "after target_1" in own
         assert "self-reported" in own
-    assert "after target_1 0.50 0.40 0.30 0.80 0.10" in words(row_of(text, "clbench/Toy-v0/sft"))
+    assert "after target_1 0.50 0.40 0.30 0.80 , trained in this stage 0.10" in words(
+        row_of(text, "clbench/Toy-v0/sft")
+    )
+
+
+def test_the_numbers_of_a_section_are_those_of_the_board(records: Path) -> None:
+    board = compute_board(records)
+    data = data_of(page(board, {}))
+    for row in board.rows:
+        shown = data["rows"][f"clbench/Toy-v0/{row.method}"]
+        names = [title for title, *_ in data["scenarios"]["clbench/Toy-v0"]["metrics"]]
+        texts = dict(zip(names, shown["metrics"], strict=True))
+        known = {
+            name.replace("_", " "): estimate
+            for name, estimate in row.estimates.items()
+            if estimate.value is not None and name.replace("_", " ") in texts
+        }
+        assert len(known) >= 5
+        assert {name: texts[name][0] for name in known} == {
+            name: format_interval(estimate) for name, estimate in known.items()
+        }
+        for value, low, high in shown["retained"]:  # what the page writes is rounded once
+            assert all(end is None or end == round(end, 9) for end in (value, low, high))
 
 
 def test_rows_show_their_groups_and_what_intervals_do_not_cover(records: Path) -> None:

@@ -188,7 +188,7 @@ def test_an_address_opens_a_row_and_the_way_back_closes_it(open_page: Callable[.
 def test_a_row_has_each_seed_its_curves_and_every_definition(open_page: Callable[..., Page]) -> None:
     page = open_page("clbench/Other-v0/sft")
     learned = row(page).locator(".matrix .learned").last
-    expect(learned).to_have_text("0.90")
+    expect(learned).to_have_text("0.90, trained in this stage")
     cells = row(page).locator(".matrix tbody")
     mean = cells.inner_html()
     row(page).get_by_role("button", name="seed 1").click()
@@ -395,16 +395,16 @@ def test_the_reader_chooses_the_axes_and_reads_why_a_picture_is_empty(open_page:
     form = page.locator("[id='clbench/Toy-v0'] form")
     picture = page.locator("[id='clbench/Toy-v0'] figure[data-plane]")
     expect(picture).to_contain_text("learned: success on each new task")
-    form.get_by_label("from bottom to top").select_option("kept skills")
+    form.get_by_label("Upward").select_option("kept skills")
     expect(picture).to_contain_text("kept skills: success on the old skills")
-    form.get_by_label("from left to right").select_option("relative cost")
+    form.get_by_label("Across").select_option("relative cost")
     expect(picture).to_contain_text("relative cost, less is better")
     note = page.locator("[data-plane-note]:visible")
     expect(note).to_contain_text(
         "Not in the picture: x_with_a_name_that_is_longer_than_a_phone (no relative cost, kept skills"
     )
     page.get_by_role("link", name="Without-v0").click()
-    page.get_by_label("from left to right").locator("visible=true").select_option("relative cost")
+    page.get_by_label("Across").locator("visible=true").select_option("relative cost")
     expect(page.locator("figure[data-plane]:visible svg")).to_have_count(0)
     expect(note).to_contain_text(
         "No method here has both kept and relative cost. Not in the picture: alone (no relative cost"

@@ -248,8 +248,8 @@ def test_a_card_says_why_the_gain_of_its_leader_is_not_certain(board: Callable[.
     assert verdicts(rows)[0].doubt == ""
     tied = {"lora": (TiedGain(0.1, Estimate(0.01, -0.01, 0.03), 4),)}
     assert verdicts(rows, tied)[0].doubt == (
-        "Tuning rated sft as highly at 0.1 times the learning rate; over that setting, the gain is "
-        "0.01 [-0.01, 0.03] and not certain."
+        "Tuning rated sft as highly at 0.1 times the scenario's learning rate; over that setting, the gain "
+        "is +0.01 [-0.01, +0.03] and not certain."
     )
     alike = board(sft=matrix(0.2), lora=matrix(0.25), finch=matrix(0.2))
     leader = alike[0]
