@@ -192,9 +192,9 @@ def test_a_row_has_each_seed_its_curves_and_every_definition(open_page: Callable
     cells = row(page).locator(".matrix tbody")
     mean = cells.inner_html()
     row(page).get_by_role("button", name="seed 1").click()
-    expect(learned).to_have_text("1.00")
+    expect(learned).to_have_text("1.00, trained in this stage")
     row(page).get_by_role("button", name="seed 0").click()
-    expect(learned).to_have_text("0.80")
+    expect(learned).to_have_text("0.80, trained in this stage")
     row(page).get_by_role("button", name="mean").click()
     assert cells.inner_html() == mean
     row(page).get_by_role("button", name="seed 1").click()
