@@ -42,7 +42,7 @@ from clbench.spec.identifiers import built_in_methods, check_method_name
 from clbench.spec.protocol import LARGEST_SEED, Protocol
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
-from clbench.worlds.schedule import is_whole
+from clbench.worlds.schedule import is_whole, whole_number
 
 LOG = logging.getLogger("clbench")
 
@@ -112,8 +112,7 @@ def evaluate_agent(
         raise WrongTypeError(
             f"{type(agent).__name__} is not an agent: it has no predict() and cannot be called."
         )
-    if steps is not None and (not is_whole(steps) or steps < 0):
-        raise InputError(f"steps must be a whole number from 0, not {steps!r}.")
+    stage, steps = int(stage), whole_number("steps", steps, 0)
     run = StagedRun(scenario, method, seed, Path(records), ONLINE_USES)
     begin = time.perf_counter()
     trained = begin - training.begun_at if steps is None and training.begun_at is not None else None
@@ -123,7 +122,7 @@ def evaluate_agent(
     with seeded("online evaluation", seed, stage):
         episodes = play(agent, scenario, run.trials(stage), seed, training.instruction, batched)
     run.report(record, stage, episodes)
-    run.count(record, stage, int(steps) if steps is not None else training.steps or None, agent)
+    run.count(record, stage, steps if steps is not None else training.steps or None, agent)
     run.time(record, trained, time.perf_counter() - begin)
     run.keep(record, stage)
     return record

@@ -192,10 +192,9 @@ def has_stages(run: ResolvedRun, checkpoints: Path, last: int | None = None) -> 
 
 def keeps_stage(run: ResolvedRun, checkpoints: Path, number: int, source: Path) -> bool:
     """Return whether all policies up to stage `number` are kept, the last one as it is in `source`."""
-    kept, name = _kept(run, checkpoints), STAGE_FILES[0]
-    return _are_whole(run, kept, number) and filecmp.cmp(
-        stage_folder(kept, number) / name, source / name, shallow=False
-    )
+    name = STAGE_FILES[0]
+    kept = stage_folder(_kept(run, checkpoints), number) / name
+    return has_stages(run, checkpoints, number) and filecmp.cmp(kept, source / name, shallow=False)
 
 
 def _are_whole(run: ResolvedRun, folder: Path, last: int | None = None) -> bool:

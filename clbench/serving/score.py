@@ -25,7 +25,7 @@ from clbench.records.reader import RecordError, read_record
 from clbench.records.record import EXTERNAL_USES, Record
 from clbench.runs.agents import UNFINISHED, StagedRun
 from clbench.spec.registry import load_scenario
-from clbench.worlds.schedule import is_whole
+from clbench.worlds.schedule import is_whole, whole_number
 
 LOG = logging.getLogger("clbench")
 
@@ -118,7 +118,7 @@ def score(
             shape, or a name or number is invalid.
         WrongTypeError: `data` is no text.
     """
-    executed, steps = _whole("executed", executed, 1), _whole("steps", steps, 0)
+    executed, steps = whole_number("executed", executed, 1), whole_number("steps", steps, 0)
     stage = int(stage) if is_whole(stage) else stage  # of NumPy, which JSON cannot hold
     if data is not None and not isinstance(data, str):
         raise WrongTypeError(f"data must be words, not {data!r}.")
@@ -152,15 +152,6 @@ def score(
     run.time(record, None, time.perf_counter() - begin)
     run.keep(record, stage)
     return record
-
-
-def _whole(name: str, value: int | None, least: int) -> int | None:
-    """Return a whole number, of Python or NumPy, as Python's."""
-    if value is None:
-        return None
-    if not is_whole(value) or value < least:
-        raise InputError(f"{name} must be a whole number from {least}, not {value!r}.")
-    return int(value)
 
 
 def _warn_if_known(server: Mapping[str, Any], record: Record, run: StagedRun, stage: int) -> None:

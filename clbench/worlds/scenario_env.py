@@ -17,7 +17,7 @@ from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 from clbench.worlds.gl_backend import draw_without_display
 from clbench.worlds.observation import Observer
-from clbench.worlds.schedule import InstructionFormat, Schedule, Start, is_whole
+from clbench.worlds.schedule import InstructionFormat, Schedule, Start
 from clbench.worlds.world import World, checked_actions
 
 Observation = dict[str, Any]
@@ -72,7 +72,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.scenario = opened_scenario(scenario, order)
         self.render_mode = render_mode
         self.instruction: InstructionFormat = instruction
-        self.stage, self.order = int(stage) if stage is not None and is_whole(stage) else stage, order
+        self.stage, self.order = stage, order
         self.steps_taken = 0
         """Steps since the environment was made."""
         self.begun_at: float | None = None

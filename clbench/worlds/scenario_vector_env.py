@@ -75,7 +75,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
             raise InputError(f"num_envs must be at least 1, not {num_envs}.")
         self.num_envs = num_envs
         self.instruction: InstructionFormat = instruction
-        self.stage, self.order = int(stage) if stage is not None and is_whole(stage) else stage, order
+        self.stage, self.order = stage, order
         self.steps_taken = 0
         """Steps of all environments together since they were made."""
         self.begun_at: float | None = None

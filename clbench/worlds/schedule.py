@@ -141,6 +141,19 @@ def is_whole(value: Any) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
+def whole_number(name: str, value: int | None, least: int) -> int | None:
+    """Return a whole number, of Python or of NumPy, as Python's, which JSON can hold; None stays None.
+
+    Raises:
+        InputError: It is no whole number, or below `least`.
+    """
+    if value is None:
+        return None
+    if not is_whole(value) or value < least:
+        raise InputError(f"{name} must be a whole number from {least}, not {value!r}.")
+    return int(value)
+
+
 def shown_instruction(words: str, form: InstructionFormat, scenario: Scenario) -> Any:
     """Return an instruction in the form of observations: text, or the ids (L,) of its tokens."""
     return np.array(word_ids([words], scenario.text_length)[0]) if form == "tokens" else words
