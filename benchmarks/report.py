@@ -91,8 +91,8 @@ def _rollouts() -> Iterator[str]:
     yield (
         f"Speed of `gym.make_vec(id, num_envs={num_envs})` with {threads} threads, as a multiple of common "
         "vector environments on the suite's own environment, and of `mj_step` alone on as many threads, "
-        "which is the limit. On LIBERO it is no limit: there it steps LIBERO's whole model, with the geoms "
-        "that are only seen, and the arm stands still. Of dm_control's three bodies, the row has the ball in "
+        "which is the limit. On LIBERO it is no limit: there it steps LIBERO's whole model, visual geoms "
+        "included, and the arm stands still. Of dm_control's three bodies, the row has the ball in "
         "a cup, whose rewards are computed together; ours holds the cup to the right. Steps per second are "
         "those of all environments together. Rows may come from different machines: compare ratios, not "
         "steps."
@@ -196,8 +196,8 @@ def _page() -> Iterator[str]:
     if "first_text_ms" in found:
         published, empty = found["first_text_ms"].values()
         yield (
-            f"Chromium shows the first text of the published page after {published:.0f} ms, and that of an "
-            f"empty page after {empty:.0f} ms."
+            f"Chromium shows the first text of the published page after {published:.0f} ms; an empty "
+            f"page takes {empty:.0f} ms."
         )
     yield ""
 

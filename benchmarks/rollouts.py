@@ -4,8 +4,8 @@ Contenders take turns in blocks of steps, in a new order each round, so that oth
 all of them equally. A ratio compares two blocks of one round; the results are the median over rounds and its
 95 % bootstrap interval. All take the same random actions and start a new episode when one ends. The peers
 step the suite's own environment, which has our physics, with the same simulated time per step; the physics
-alone is the same number of threads that only call `mujoco.mj_step` on it. LIBERO's has the whole model of
-LIBERO, with what is only seen, and its arm stands still.
+alone is the same number of threads that only call `mujoco.mj_step` on it. For
+LIBERO, it steps LIBERO's whole model, visual geoms included, and the arm stands still.
 
     python benchmarks/rollouts.py fetch libero
 
