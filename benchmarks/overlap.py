@@ -9,14 +9,13 @@ to benchmarks/results/overlap.json, and docs/reference/overlap.md is made from t
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from result_files import FOLDER, read_results
+from result_files import read_results, write_row
 
 import clbench
 from clbench.base.entry_points import resolve
@@ -41,11 +40,11 @@ Act = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 INTRODUCTION = f"""\
 # What else succeeds
 
-A success rule judges the state that is reached, not the way there. This page shows what succeeds on a task
-without having learned it: doing nothing, uniformly random actions, and the experts of the scenario's other
-tasks, background included ({EPISODES} episodes each; experts below {LEAST} are left out). Read `learned` and
-`kept` of a task beside these rates: where the expert of another task succeeds, a policy that does the other
-task's motion also counts as knowing this one.
+A success rule judges the state that is reached, not the way there. For the scenarios below, this page shows
+what succeeds on a task without having learned it: doing nothing, uniformly random actions, and the experts of
+the scenario's other tasks, background included ({EPISODES} episodes each; experts below {LEAST} are left out).
+Read `learned` and `kept` of a task beside these rates: where the expert of another task succeeds, a policy that
+does the other task's motion also counts as knowing this one.
 
 "Known from the first state" is the share of episodes whose task the first state alone tells, by a vote of the
 {NEIGHBOURS} nearest of {EPISODES // 2} episodes of each task. Where it is high, a policy can do without the
@@ -59,14 +58,10 @@ def main() -> None:
     """Measure the scenarios that are named, all if none is, and write the results and the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("ids", nargs="*", default=SCENARIOS, help="Gymnasium ids of scenarios")
-    results = read_results("overlap") or {}
     for name in parser.parse_args().ids:
-        results[name] = measured(clbench.load_scenario(name))
+        write_row("overlap", "scenarios", name, measured(clbench.load_scenario(name)))
         print(f"{name}: measured")
-    ordered = dict.fromkeys([*SCENARIOS, *results])
-    results = {name: results[name] for name in ordered if name in results}
-    (FOLDER / "overlap.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-    PAGE.write_text(page(results), encoding="utf-8")
+    PAGE.write_text(page(read_results("overlap")["scenarios"]), encoding="utf-8")
 
 
 def measured(scenario: Scenario, episodes: int = EPISODES) -> dict[str, Any]:

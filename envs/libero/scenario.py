@@ -225,7 +225,7 @@ GOAL = Scenario(
 
 The skills carry the bowl or the bottle to five places. Each target has a motion of its own: pull, carry
 another thing, turn and push. Evaluations are half as many as in Fetch-v1, and demonstrations a quarter: a
-step costs seven times as much.
+step costs nine times as much.
 """
 
 SPATIAL = Scenario(

@@ -25,6 +25,7 @@ from .format import (
     Rows,
     agreement_text,
     aligned,
+    column_title,
     fitting,
     number_text,
     scaled,
@@ -77,6 +78,8 @@ class _Head:
     value: Callable[[Any], float | None] = lambda _: None
     """Returns the number in a row, of which the best of a division is bold."""
     higher_is_better: bool | None = None
+    stays: bool = False
+    """Whether a narrow terminal keeps it."""
 
 
 def terminal(table: Summary, width: int = 108, sort: str | None = None) -> RenderableType:
@@ -85,15 +88,15 @@ def terminal(table: Summary, width: int = 108, sort: str | None = None) -> Rende
     Args:
         table: The table.
         width: Width of the terminal in characters; columns that do not fit are named below each table.
-        sort: Name of the metric that orders the rows of each division, the best first; None for the board's
-            own order.
+        sort: Name of the metric that orders the rows of each division, the best first; its column is always
+            shown. None for the board's own order.
     """
     # Text and not str: rich would obey markup in a stranger's words.
     parts: list[RenderableType] = []
     tables: list[Rows] = []
     for scenario, rows in tables_of(table.rows).items():
         tables.append(rows)
-        parts += _fitted(scenario, _sorted(rows, sort), _heads(rows), width)
+        parts += _fitted(scenario, _sorted(rows, sort), _heads(rows, sort), width)
         sentences = (
             start_text(table.starts.get(scenario)),
             unpaired_text(table.unpaired.get(scenario)),
@@ -137,8 +140,8 @@ def _fitted(
     for name in DROPPED_FIRST:
         if _width(_table(title, rows, kept, WIDEST_NAME)) <= width:
             break
-        dropped += [head.title for head in kept if head.title == name]
-        kept = [head for head in kept if head.title != name]
+        dropped += [head.title for head in kept if head.title == name and not head.stays]
+        kept = [head for head in kept if head.title != name or head.stays]
     line = f"Too wide for {width} columns: {', '.join(dropped)}. The page and --json show every column."
     return [_table(title, rows, kept), *([Text(line, style="italic")] if dropped else [])]
 
@@ -193,12 +196,12 @@ def _letters(row: RowSummary | OverallRow, rows: Sequence[Any]) -> str:
     return aligned(row.letters, rows) if isinstance(row, RowSummary) else ""
 
 
-def _heads(rows: list[RowSummary]) -> list[_Head]:
+def _heads(rows: list[RowSummary], sort: str | None) -> list[_Head]:
     """Return the columns of the table of one scenario."""
     tried = [_Head("tried", lambda row: number_text(row.tried, "d"))] if rows[0].to_criterion else []
     return [
         _Head("seeds", lambda row: str(len(row.seeds))),
-        *_metric_heads(rows),
+        *_metric_heads(rows, sort),
         *tried,
         _Head("cost", lambda row: number_text(row.costs["relative_cost"], ".2f")),
         _Head("bytes kept", _size),
@@ -212,7 +215,12 @@ def _overall_heads(rows: Sequence[OverallRow]) -> list[_Head]:
     return [letters, *_metric_heads(rows)]
 
 
-def _metric_heads(rows: Rows) -> list[_Head]:
+def _metric_heads(rows: Rows, sort: str | None = None) -> list[_Head]:
+    """Return the columns of the metrics that fit, and of the one that the rows are sorted by."""
+    columns = list(fitting(rows))
+    if sort is not None and sort not in {column.metric.name for column in columns}:
+        columns.append(Column(METRICS[sort], column_title(sort, rows[0].to_criterion)))
+
     def head(column: Column) -> _Head:
         name = column.metric.name
         return _Head(
@@ -220,9 +228,10 @@ def _metric_heads(rows: Rows) -> list[_Head]:
             lambda row: _compact(row.estimates[name], column),
             lambda row: row.estimates[name].value,
             column.metric.higher_is_better,
+            stays=name == sort,
         )
 
-    return [head(column) for column in fitting(rows)]
+    return [head(column) for column in columns]
 
 
 def _size(row: RowSummary) -> str:

@@ -83,6 +83,21 @@ def test_one_scenario_is_shown_in_the_order_of_a_metric(
     assert order == {"adaptation": False, "retention": True}
 
 
+@pytest.mark.parametrize("metric", ["forgetting", "kept_share"])
+def test_a_narrow_terminal_keeps_the_column_that_it_is_sorted_by(
+    metric: str, four_methods: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    arguments = ["leaderboard", "clbench/Toy-v0", "--records", str(four_methods)]
+    heads = []
+    for sort in ([], ["--sort", metric]):
+        app([*arguments, *sort], result_action="return_value")
+        heads.append(capsys.readouterr().out.partition("Too wide")[0].split())
+    words = metric.split("_")
+    assert not set(words) & set(heads[0])
+    assert set(words) <= set(heads[1])
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
