@@ -40,11 +40,11 @@ Act = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 INTRODUCTION = f"""\
 # What else succeeds
 
-A success rule judges the state that is reached, not the way there. For the scenarios below, this page shows
-what succeeds on a task without having learned it: doing nothing, uniformly random actions, and the experts of
-the scenario's other tasks, background included ({EPISODES} episodes each; experts below {LEAST} are left out).
-Read `learned` and `kept` of a task beside these rates: where the expert of another task succeeds, a policy that
-does the other task's motion also counts as knowing this one.
+A success rule judges the state that is reached, not the way there. For the scenarios below, this page
+shows what succeeds on a task without having learned it: doing nothing, uniformly random actions, and the
+experts of the scenario's other tasks, background included ({EPISODES} episodes each; experts below
+{LEAST} are left out). Read `learned` and `kept` of a task beside these rates: where the expert of another
+task succeeds, a policy that does the other task's motion also counts as knowing this one.
 
 "Known from the first state" is the share of episodes whose task the first state alone tells, by a vote of the
 {NEIGHBOURS} nearest of {EPISODES // 2} episodes of each task. Where it is high, a policy can do without the
