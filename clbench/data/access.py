@@ -1,10 +1,10 @@
 """Access rules: the data that the hooks of a stage must not see. Every run checks them.
 
 The hooks of a method may use the objects that the runner passes to them, and no data of a later stage. They
-may run the validation episodes of tasks up to their own, but no test episode, and ask no test question. They
-may read the demonstrations of their own target, and of earlier tasks if `uses` declares it. After `prepare`,
-each stage and `load_state`, the policy must still have the normalisation of the retained skills, its
-vocabulary and its sizes.
+may read the demonstrations of their own target, and of earlier tasks if `uses` declares it, and run the
+validation episodes of the same tasks: a policy that still knows a task makes demonstrations of it by playing.
+They may run no test episode and ask no test question. After `prepare`, each stage and `load_state`, the policy
+must still have the normalisation of the retained skills, its vocabulary and its sizes.
 
 These checks find mistakes. They do not stop a method that avoids the functions of clbench, see
 `docs/guide/security.md`.
@@ -34,7 +34,7 @@ class _Rights(NamedTuple):
     known: frozenset[str]
     """Names of the tasks that they may know."""
     readable: frozenset[str]
-    """Names of those whose demonstrations they may read."""
+    """Names of those whose demonstrations they may read and whose episodes they may run."""
 
 
 _rights: ContextVar[_Rights | None] = ContextVar("rights", default=None)
@@ -61,7 +61,7 @@ def hooks(known: Iterable[str], readable: Iterable[str]) -> Iterator[None]:
 
     Args:
         known: Names of the tasks that it may know.
-        readable: Names of those whose demonstrations it may read.
+        readable: Names of those whose demonstrations it may read and whose episodes it may run.
 
     Raises:
         HookExitError: The code raises what is no `Exception`, such as `SystemExit`, or `KeyboardInterrupt`
@@ -105,16 +105,11 @@ def check_demonstrations(task: str) -> None:
     Raises:
         LeakError: The task comes after their stage, or the method does not declare that it reads them.
     """
-    rights = _rights.get()
-    if rights is None or task in rights.readable:
-        return
-    if task not in rights.known:
-        raise LeakError(f"The method reads demonstrations of {task}, which its stage must not know yet.")
-    raise LeakError(f"The method reads demonstrations of {task}, which its `uses` does not declare.")
+    _check_task(task, "reads demonstrations")
 
 
 def check_episodes(episodes: Iterable[tuple[str, Split]]) -> None:
-    """Refuse to the running hooks all episodes but validation episodes of tasks that they may know.
+    """Refuse to the running hooks all episodes but validation episodes of tasks that they may read.
 
     Args:
         episodes: Task and split of each episode.
@@ -122,14 +117,20 @@ def check_episodes(episodes: Iterable[tuple[str, Split]]) -> None:
     Raises:
         LeakError: An episode is refused.
     """
-    rights = _rights.get()
-    if rights is None:
+    if _rights.get() is None:
         return
     for task, split in episodes:
         if split != "validation":
             raise LeakError(f"The method runs {split} episodes of {task}: nothing may be chosen on them.")
-        if task not in rights.known:
-            raise LeakError(f"The method runs episodes of {task}, which its stage must not know yet.")
+        _check_task(task, "runs episodes")
+
+
+def _check_task(task: str, does: str) -> None:
+    rights = _rights.get()
+    if rights is None or task in rights.readable:
+        return
+    why = "its `uses` does not declare" if task in rights.known else "its stage must not know yet"
+    raise LeakError(f"The method {does} of {task}, which {why}.")
 
 
 def check_questions() -> None:

@@ -67,7 +67,11 @@ def demonstrate(world: World, task: Task, seed: int, noisy: bool) -> Demonstrati
         seed: Seed of the initial state and of the action noise.
         noisy: Whether 3 to 6 random actions replace the expert's now and then, with the probability that the
             task gives. Such an episode shows how to recover.
+
+    Raises:
+        LeakError: The running hooks of a method must not read demonstrations of the task.
     """
+    check_demonstrations(task.name)
     expert = resolve(task.expert)(task.name)
     generator = np.random.default_rng([seed, 1])
     low, high = _action_bounds(world)

@@ -198,7 +198,7 @@ class Method:
         """
 
     def state(self) -> MethodState:
-        """Return everything that later hooks need; the bytes of its tensors count as kept.
+        """Return everything that later hooks need; its tensors, strings and numbers count as bytes kept.
 
         Every stage begins with a new object of the method that receives only this state, whether or not the
         run was interrupted.

@@ -239,7 +239,7 @@ class Costs:
     parameters_added: int | None = None
     """Parameters that the final policy has more than the pretrained one; negative if it has fewer."""
     bytes_kept: int | None = None
-    """Bytes of prior data and of method state that are kept to the end."""
+    """Bytes of prior data and of method state that a stage passes to the next one, where they are most."""
     environment_steps: int | None = None
     """Environment steps of an agent that learned online."""
 

@@ -22,6 +22,7 @@ from clbench.evaluation.checks import Checker
 from clbench.evaluation.examiner import Examiner
 from clbench.learning.adaptation import Step
 from clbench.learning.hooks import place_of
+from clbench.learning.method import MethodState
 from clbench.learning.optimise import deterministic
 from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.registry import describe_method
@@ -132,6 +133,15 @@ def _added_buffers(trainer: Trainer) -> list[torch.Tensor]:
     return [value for name, value in trainer.policy.named_buffers() if name not in usual]
 
 
+def _bytes(value: torch.Tensor | str | float | bool | None) -> int:
+    """Return the size of an entry of a method's state; a Boolean or None is a mark, not data."""
+    if isinstance(value, torch.Tensor):
+        return value.nbytes
+    if isinstance(value, str):
+        return len(value.encode())
+    return 0 if value is None or isinstance(value, bool) else 8
+
+
 @dataclasses.dataclass
 class _Run:
     """A run in progress: the trainer, the examiner, and the record so far.
@@ -240,7 +250,7 @@ class _Run:
             self._stage(number)
             self._save(number)
         self._load(len(scenario.target))
-        self._count_costs()
+        self.record.costs.parameters_added = _parameters(self.trainer) - (self.record.costs.parameters or 0)
         if relearns(self.run.protocol):
             self._relearn()
         if self.run.protocol.split == "test" and scenario.target and self.run.spec.method != BASELINE:
@@ -326,18 +336,18 @@ class _Run:
         seconds = self.seconds_before + time.perf_counter() - self.begin
         self.record.timing["seconds"] = round(seconds, 2)
 
-    def _count_costs(self) -> None:
-        costs, state = self.record.costs, self.trainer.state(len(self.run.scenario.target))
-        tensors = [value for value in state.values() if isinstance(value, torch.Tensor)]
-        costs.parameters_added = _parameters(self.trainer) - (costs.parameters or 0)
-        kept = self.trainer.prior(len(self.run.scenario.target), ("throughout",)).bytes
-        costs.bytes_kept = kept + sum(tensor.nbytes for tensor in (*tensors, *_added_buffers(self.trainer)))
+    def _count_bytes(self, number: int, state: MethodState) -> None:
+        """Count what stage `number` passes on; the row shows the most that any stage does."""
+        kept = self.trainer.prior(number, ("throughout",)).bytes + sum(map(_bytes, state.values()))
+        kept += sum(buffer.nbytes for buffer in _added_buffers(self.trainer))
+        self.record.costs.bytes_kept = max(self.record.costs.bytes_kept or 0, kept)
 
     # ---- checkpoints -------------------------------------------------------------------------------
 
     def _save(self, number: int) -> None:
         """Write a checkpoint after stage `number`, and keep its policy if asked to; remove the one before."""
         state = self.trainer.state(number)
+        self._count_bytes(number, state)
         self.lease.check()
 
         def write(folder: Path) -> None:

@@ -11,14 +11,18 @@ from clbench.base.cache import cache_folder, cached, hash_of, hash_of_tensors, i
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.data.training_data import TrainingData
 from clbench.evaluation.examiner import Examiner
+from clbench.learning.method import Method
 from clbench.learning.optimise import deterministic
 from clbench.learning.pretraining import pretrained_policy
+from clbench.learning.registry import describe_method
 from clbench.learning.trainer import training_inputs
 from clbench.policy.policy import Policy
 from clbench.records.record import Record
 from clbench.runs.fingerprint import arithmetic
 from clbench.runs.length import point_length
 from clbench.runs.spec import ResolvedRun
+from clbench.spec.identifiers import built_in_methods
+from clbench.spec.references import BASELINE
 
 TABLES = ("episodes", "answers", "policy")
 """Tables of a record that an evaluation fills."""
@@ -63,6 +67,7 @@ def evaluate_pretrained(run: ResolvedRun, progress: ProgressCallback = no_progre
     Returns:
         Its success on the retained skills; None without any.
     """
+    run = _of_baseline(run)
     with deterministic(run.spec.device):
         policy, _ = pretrained_policy(run.scenario, run.spec.seed)
         policy = policy.to(run.spec.device)
@@ -79,13 +84,22 @@ def evaluate_pretrained(run: ResolvedRun, progress: ProgressCallback = no_progre
 def is_evaluated(run: ResolvedRun) -> bool:
     """Return whether the cache has the evaluation of the pretrained policy; the policy must exist."""
     policy, _ = pretrained_policy(run.scenario, run.spec.seed)
-    return is_cached(*_kept(run, policy))
+    return is_cached(*_kept(_of_baseline(run), policy))
+
+
+def _of_baseline(run: ResolvedRun) -> ResolvedRun:
+    """Return the run of plain fine-tuning, which prepares nothing."""
+    return dataclasses.replace(run.spec, method=BASELINE, changes={}).resolve()
 
 
 def _kept(run: ResolvedRun, policy: Policy) -> tuple[Path, dict[str, Any]]:
     """Return the folder of an evaluation in the cache, and everything that it depends on."""
     spec = run.spec
+    # built-in methods change what a policy computes by its weights alone; `prepare` of another one may add a
+    # hook or replace `act`, which no weight shows
+    own = run.method.prepare is not Method.prepare and spec.method not in built_in_methods()
     inputs = {
+        **({"method": describe_method(run.method), "settings": run.info.settings} if own else {}),
         "policy": hash_of_tensors(policy.state_dict()),
         "scenario": dataclasses.asdict(run.scenario_info),
         "spec": [spec.seed, spec.device, spec.split, spec.perturb],

@@ -14,7 +14,8 @@ TOY = "clbench.testing:clbench/Toy-v0"
 METHODS = '''
 import dataclasses
 
-from clbench.data.demonstrations import dataset_folder, load_demonstrations, read_dataset
+from clbench.base.entry_points import resolve
+from clbench.data.demonstrations import dataset_folder, demonstrate, load_demonstrations, read_dataset
 from clbench.evaluation.episodes import Trial
 from clbench.evaluation.players import play
 from clbench.evaluation.rollouts import Evaluator
@@ -91,6 +92,27 @@ class EarlyChooser(Chooser):
 
     split = "validation"
     task = 1
+
+
+@dataclasses.dataclass
+class Rehearser(Method):
+    """It plays what it can already do, to replay it, and declares no prior data."""
+
+    def end_task(self, policy, stage):
+        evaluator = Evaluator(TOY, 7)
+        try:
+            evaluator.play(policy, [Trial(TOY.retained[0], "validation", 1000)])
+        finally:
+            evaluator.close()
+
+
+@dataclasses.dataclass
+class Pupil(Method):
+    """It asks the expert of a skill for an episode, and declares no prior data."""
+
+    def start_task(self, policy, stage):
+        demonstrate(resolve(TOY.retained[0].world)(), TOY.retained[0], 0, noisy=False)
+        return super().start_task(policy, stage)
 
 
 @dataclasses.dataclass
@@ -173,6 +195,8 @@ def _methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("Chooser", "runs test episodes of right: nothing may be chosen on them"),
         ("RobustChooser", "runs perturbed episodes of right: nothing may be chosen on them"),
         ("EarlyChooser", "runs episodes of down, which its stage must not know yet"),
+        ("Rehearser", "runs episodes of left, which its `uses` does not declare"),
+        ("Pupil", "reads demonstrations of left, which its `uses` does not declare"),
         ("Player", "runs test episodes of right: nothing may be chosen on them"),
         ("Asker", "loads questions by itself, the test questions too"),
         ("Normaliser", "changes state_mean: the normalisation is fixed in pretraining"),

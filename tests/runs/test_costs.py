@@ -63,6 +63,19 @@ class Hiding(Method):
 
 
 @dataclasses.dataclass
+class Dropping(Method):
+    """Keeps data in tensors, text and numbers, and nothing after the last target."""
+
+    def end_task(self, policy: Policy, stage: Stage) -> None:
+        self.is_over = stage.number == len(TINY.target)
+
+    def state(self) -> Any:
+        if getattr(self, "is_over", False):
+            return {}
+        return {"tensor": torch.zeros(3).double(), "text": "café!", "one": 1, "half": 0.5, "mark": True}
+
+
+@dataclasses.dataclass
 class Growing(Method):
     """Adds five parameters to the policy."""
 
@@ -138,6 +151,14 @@ def test_a_buffer_that_the_method_added_is_kept_data(
 ) -> None:
     record = execute(RunSpec(TINY.id, stranger(Hiding), seed=0), tmp_path)
     assert record.costs.bytes_kept == 16 * 4
+
+
+@pytest.mark.long
+def test_numbers_and_text_are_kept_data_also_in_a_state_that_the_last_stage_drops(
+    stranger: Callable[[type[Method]], str], tmp_path: Path
+) -> None:
+    record = execute(RunSpec(TINY.id, stranger(Dropping), seed=0), tmp_path)
+    assert record.costs.bytes_kept == 3 * 8 + 6 + 2 * 8  # "é" takes two bytes; a mark is no data
 
 
 @pytest.mark.long

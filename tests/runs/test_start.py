@@ -1,16 +1,21 @@
 """The evaluation before the first target: done once, and shared by runs."""
 
+import dataclasses
 import shutil
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from tiny import TINY
 
 from clbench.base.cache import cache_folder, cached
 from clbench.base.lease import Lease
+from clbench.learning.method import Method
+from clbench.policy.policy import Policy
 from clbench.runs.length import run_length
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
@@ -73,6 +78,24 @@ def test_the_pretrained_policy_is_evaluated_once(tmp_path: Path, reports: Path) 
     assert starts[0] == starts[1]
     execute(RunSpec(TINY.id, "frozen", seed=0, perturb=True), tmp_path)
     assert len(list(reports.iterdir())) == 2  # a perturbed evaluation has more episodes
+
+
+@dataclasses.dataclass
+class Still(Method):
+    """A method whose policy does nothing, though its weights are those of the pretrained one."""
+
+    def prepare(self, policy: Policy, prior: Any) -> None:
+        policy.act = lambda state, words, noise, image: torch.zeros_like(noise)  # type: ignore[method-assign]
+
+
+@pytest.mark.long
+def test_a_method_that_changes_how_the_policy_computes_evaluates_for_itself(
+    tmp_path: Path, reports: Path, stranger: Callable[[type[Method]], str]
+) -> None:
+    execute(RunSpec(TINY.id, "sft", seed=0), tmp_path)
+    still = execute(RunSpec(TINY.id, stranger(Still), seed=0), tmp_path)
+    assert still.retained_at_start() == 0.0
+    assert len(list(reports.iterdir())) == 2
 
 
 @pytest.mark.long
