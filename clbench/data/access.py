@@ -3,8 +3,8 @@
 The hooks of a method may use the objects that the runner passes to them, and no data of a later stage. They
 may read the demonstrations of their own target, and of earlier tasks if `uses` declares it, and run the
 validation episodes of the same tasks: a policy that still knows a task makes demonstrations of it by playing.
-They may run no test episode and ask no test question. After `prepare`, each stage and `load_state`, the policy
-must still have the normalisation of the retained skills, its vocabulary and its sizes.
+They may run no test episode and ask no test question. After `prepare`, each stage and `load_state`, the
+policy must still have the normalisation of the retained skills, its vocabulary and its sizes.
 
 These checks find mistakes. They do not stop a method that avoids the functions of clbench, see
 `docs/guide/security.md`.

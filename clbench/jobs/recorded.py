@@ -97,14 +97,15 @@ def set_aside(run: ResolvedRun, records: Path) -> str | None:
 def changed_code(record: Record, run: ResolvedRun) -> list[str]:
     """Return the names of the method and the policy, if their code is not that of a record any more.
 
-    Methods with a name of their own have versions; a "module:Class" is work in progress.
+    The version of a method with a name of its own says whether it is; a "module:Class" is work in progress.
     """
     from clbench.learning.registry import describe_method
 
     changed, method, policy = [], run.spec.method, run.spec.policy
     recorded = record.fingerprint.get("method")
-    source = recorded.get("source") if isinstance(recorded, dict) else None
-    if ":" in method and source != describe_method(run.method)["source"]:
+    part = "source" if ":" in method else "version"
+    known = recorded.get(part) if isinstance(recorded, dict) else None
+    if known != describe_method(run.method)[part]:
         changed.append(method)
     if ":" in policy and record.fingerprint.get("policy") != policy_source(policy):
         changed.append(policy)

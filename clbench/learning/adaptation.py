@@ -9,8 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from clbench.base.text import counted
 from clbench.learning.method import Method, Progress, Stage
-from clbench.learning.optimise import GradientError, MethodError, optimise, warm_up
+from clbench.learning.optimise import GradientError, MethodError, optimise, steps_counted, warm_up
 from clbench.learning.prior import begin_step, end_steps
 from clbench.policy.policy import Policy
 from clbench.spec.budget import Budget
@@ -50,9 +51,16 @@ def adapt(
 
     Raises:
         GradientError: A gradient is not finite; the message names its parameter.
-        MethodError: Optimisation fails, or leaves a parameter that is not finite.
+        MethodError: Optimisation fails, or leaves a parameter that is not finite. Or `start_task` takes
+            optimiser steps of its own although a criterion ends the stage.
     """
-    chosen = method.start_task(policy, stage)
+    with steps_counted() as taken:
+        chosen = method.start_task(policy, stage)
+    if budget.criterion is not None and taken():
+        raise MethodError(
+            f"start_task() took {counted(taken(), 'optimiser step')}. A target is learned in the steps that "
+            "follow, whose checks end the stage: what is learned before them would not count."
+        )
     if chosen is None:
         raise MethodError(
             "start_task() must return the parameters to train, not None: `return policy.parameters()` is all."

@@ -39,6 +39,10 @@ if TYPE_CHECKING:
 LOG = logging.getLogger("clbench")
 
 
+LENGTH = "steps.txt"
+"""File of a stage that was made again: the optimiser steps of its training loop."""
+
+
 class MachineError(ClbenchError, OSError):
     """While a method ran, the machine had no room for a file, or its disk or network failed."""
 
@@ -143,6 +147,7 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
             )
 
         with method_needed(run, trainer):
+            steps = 0
             if number:
                 trainer.load(stage_folder(root, number - 1), number - 1)
                 steps = trainer.learn(number, after)
@@ -150,6 +155,7 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
             else:
                 trainer.prepare(progress)
             trainer.save(folder, trainer.state(number))
+            (folder / LENGTH).write_text(f"{steps}\n", encoding="utf-8")
 
     checker = Checker(scenario, run.protocol, run.spec.seed)
     with closing(checker), deterministic(run.spec.device):
@@ -160,6 +166,12 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
             else:
                 cached(folder, identity, functools.partial(make, number))
     return root
+
+
+def lengths_of_stages(run: ResolvedRun, made: Path) -> list[int]:
+    """Return the steps of the training loop in each stage, from the folder that `make_stages` filled."""
+    numbers = range(1, len(run.scenario.target) + 1)
+    return [int((stage_folder(made, number) / LENGTH).read_text(encoding="utf-8")) for number in numbers]
 
 
 def load_stages(run: ResolvedRun, folder: Path) -> list[Policy]:
@@ -210,7 +222,7 @@ def _kept(run: ResolvedRun, checkpoints: Path) -> Path:
 def _made(run: ResolvedRun) -> Path:
     """Return the folder in the cache for policies that this code made again on hardware like this."""
     made_by = {"method": describe_method(run.method), "hardware": arithmetic(run.spec.device)}
-    inputs = {**_identity(run, 0), **made_by, **training_inputs(run.scenario, run.spec.seed)}
+    inputs = {**_identity(run, 0), **made_by, "file": LENGTH, **training_inputs(run.scenario, run.spec.seed)}
     return cache_folder() / "stages" / hash_of(inputs)
 
 

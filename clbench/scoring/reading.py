@@ -73,7 +73,8 @@ def _read_ends(record: Record) -> tuple[int, ...]:
     """Return the steps of each stage, from its checks.
 
     Raises:
-        RecordError: A check is impossible, or a stage does not end with its criterion or its last step.
+        RecordError: A check is impossible, a stage does not end with its criterion or its last step, or the
+            run states fewer optimiser steps.
     """
     protocol = record.scenario.protocol(record.run.split, record.run.perturb)
     by_stage: dict[int, list[CheckRow]] = {stage: [] for stage in protocol.stages[1:]}
@@ -95,7 +96,15 @@ def _read_ends(record: Record) -> tuple[int, ...]:
         # a method that trains nothing is checked once
         if not learned[-1] and rows[-1].step not in (0, planned[-1]):
             raise RecordError(f"{where} end before the criterion was met.")
-    return tuple(rows[-1].step for rows in by_stage.values())
+    ends = tuple(rows[-1].step for rows in by_stage.values())
+    costs = record.costs
+    least = sum(ends) + (costs.preparation_steps or 0)
+    if costs.optimiser_steps is not None and costs.optimiser_steps < least:
+        raise RecordError(
+            f"costs: {costs.optimiser_steps} optimiser steps are fewer than the {least} of the preparation "
+            "and of the stages, by its checks."
+        )
+    return ends
 
 
 def read_checks(record: Record, protocol: Protocol) -> tuple[Array, Array]:

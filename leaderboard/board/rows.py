@@ -226,12 +226,14 @@ def _heights(
     """Return what orders the rows of a division, by method; None without a final average.
 
     It is the final average minus that of plain fine-tuning over the seeds that both have: seeds differ so
-    much that the final averages of different seeds say little. If one of the rows shares no seed with plain
-    fine-tuning, it is the final average for all of them.
+    much that the final averages of different seeds say little. A row that shares no seed with plain
+    fine-tuning has None beside rows that do; if none does, it is the final average for all of them.
     """
     known = [method for method, final in finals.items() if final is not None]
     gains = {method: mean_difference(RANKED_BY, rows[method], baseline) for method in known}
-    return dict(finals) if None in gains.values() else {method: gains.get(method) for method in finals}
+    if all(gain is None for gain in gains.values()):
+        return dict(finals)
+    return {method: gains.get(method) for method in finals}
 
 
 def _falling(height: float | None) -> float:

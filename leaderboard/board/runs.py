@@ -170,7 +170,7 @@ def _check_settings(run: RunInfo) -> None:
         raise RecordError(f"run: changes and settings differ in {', '.join(lost)}.")
     if method not in built_in_methods():
         return
-    uses, defaults = _declared(run.scenario, method)
+    uses, defaults = _declared(run.scenario, method, run.split != "validation")
     if run.uses != uses:
         raise RecordError(f"run: uses do not match {method}: {', '.join(differences(run.uses, uses))}.")
     # a setting that is missing here was added later, with a default that changes nothing
@@ -184,17 +184,22 @@ def _check_settings(run: RunInfo) -> None:
 
 
 @cache
-def _declared(scenario: str, method: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the prior data that a built-in method uses, and its hyper-parameters, tuned for the scenario."""
+def _declared(scenario: str, method: str, tuned: bool = True) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the prior data that a built-in method uses, and its settings, tuned for the scenario or not."""
     cls = built_in_methods()[method].load()
-    return dataclasses.asdict(cls.uses), {**dataclasses.asdict(cls()), **tuned_settings(scenario, method)}
+    settings = tuned_settings(scenario, method) if tuned else {}
+    return dataclasses.asdict(cls.uses), {**dataclasses.asdict(cls()), **settings}
 
 
 def _check_kind(run: RunInfo, changed: bool | None) -> None:
-    """Refuse a tuning run, or one with changed settings where none are expected, or the reverse."""
+    """Refuse a tuning run where test runs are wanted, and changed settings where none may be, or the reverse.
+
+    If `changed` is None, any kind will do, but no test run has a tuning seed.
+    """
     if run.split == "validation":
-        raise RecordError("it is a tuning run: settings may have been chosen on its episodes.")
-    if run.trained_elsewhere and run.seed >= FIRST_TUNING_SEED:
+        if changed is not None:
+            raise RecordError("it is a tuning run: settings may have been chosen on its episodes.")
+    elif run.seed >= FIRST_TUNING_SEED:
         raise RecordError(
             f"seeds from {FIRST_TUNING_SEED} are for tuning: settings may be chosen on its episodes."
         )
@@ -349,9 +354,10 @@ def same_settings(runs: list[Run]) -> Sifted:
 
 
 def _learner(run: Run) -> dict[str, Any]:
-    """Return what the names of an agent, a method "module:Class" and a policy "module:Class" leave open.
+    """Return what the names of an agent, of a method and of a policy "module:Class" leave open.
 
-    Two agents that share a name make no row together, and neither do seeds of code that changed between them.
+    Two agents that share a name make no row together, and neither do seeds of code that changed between them,
+    which the version of a method with a name of its own tells.
     """
     made, info = run.record.fingerprint, run.record.run
     method = made.get("method")
@@ -361,6 +367,8 @@ def _learner(run: Run) -> dict[str, Any]:
         learner["class of the agent"] = known.get("class")
     elif ":" in info.method:
         learner["code of the method"] = known.get("source")
+    else:
+        learner["version of the method"] = known.get("version")
     if ":" in info.policy:
         learner["code of the policy"] = made.get("policy")
     return learner

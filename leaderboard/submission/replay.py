@@ -28,7 +28,7 @@ from clbench.records.paths import stage_folder
 from clbench.records.record import EpisodeRow
 from clbench.runs.run import pretrained_hash
 from clbench.runs.spec import check_device
-from clbench.runs.stages import kept_stages, load_stages, make_stages, method_needed
+from clbench.runs.stages import kept_stages, lengths_of_stages, load_stages, make_stages, method_needed
 from clbench.spec.protocol import Point
 
 from .subject import Check, Subject, some
@@ -68,15 +68,17 @@ def replay(subject: Subject, progress: ProgressCallback) -> list[Check]:
         return [Check("policies", result, None)]
     kept = kept_stages(subject.resolved, subject.request.checkpoints)
     with deterministic(spec.device):
+        lengths = None
         if kept is None:
-            policies = load_stages(subject.resolved, make_stages(subject.resolved, progress))
+            made = make_stages(subject.resolved, progress)
+            policies, lengths = load_stages(subject.resolved, made), lengths_of_stages(subject.resolved, made)
             checks = [Check("policies", "trained again", True)]
         else:
             policies = load_stages(subject.resolved, kept)
             checks = [Check("policies", "kept by the run", True), _start(subject, policies[0], progress)]
         checks += [_replay_episodes(subject, policies), _replay_answers(subject, policies)]
     if subject.scenario.budget.criterion:
-        checks += _replay_checks(subject, policies)
+        checks += _replay_ends(subject, policies, lengths)
     if kept is not None:
         checks.append(_go_on(subject, kept, policies))
     return checks
@@ -159,11 +161,20 @@ def least_found(count: int, looked_at: int) -> int:
     )
 
 
-def _replay_checks(subject: Subject, policies: Sequence[Policy]) -> list[Check]:
-    """Repeat the last check of each stage with the policy that the stage left."""
+def _replay_ends(subject: Subject, policies: Sequence[Policy], lengths: list[int] | None) -> list[Check]:
+    """Compare the lengths of stages, and repeat the last check of each with the policy that it left.
+
+    Args:
+        subject: The record.
+        policies: The policies of the stages.
+        lengths: Steps of the stages that were trained again; None if the run kept its policies.
+    """
+    last = {row.stage: row for row in subject.run.record.check_rows()}
+    ends = [row.step for row in last.values()]
+    if lengths is not None and lengths != ends:
+        return [Check("ends of stages", f"after {ends} steps; trained again, after {lengths}", False)]
     if subject.resolved.method.whole_stages:
         return []  # the policy changed after the last check
-    last = {row.stage: row for row in subject.run.record.check_rows()}
     targets = subject.scenario.target
     with closing(Checker(subject.scenario, subject.protocol, subject.spec.seed)) as checker:
         wrong = [
@@ -192,19 +203,22 @@ def _go_on(subject: Subject, kept: Path, policies: Sequence[Policy]) -> Check:
         trainer.load(stage_folder(kept, number - 1), number - 1)
         trainer.learn(number, lambda step: step.done >= steps)
     moved, apart = _distance(before, after), _distance(trainer.policy, after)
+    same_parts = trainer.policy.state_dict().keys() == after.state_dict().keys()
+    count = len(run.scenario.target)
     return Check(
         "from stage to stage",
-        f"stage {number} ({run.scenario.target[number - 1].name}) moved the kept policy by {moved:.3g}; "
-        f"trained again, it ends {apart:.2g} away from there",
-        apart <= LARGEST_DRIFT * moved,
+        f"stage {number} of {count} ({run.scenario.target[number - 1].name}) moved the kept policy by "
+        f"{moved:.3g}; trained again, it ends {apart:.2g} away from there; one made-up policy would be found "
+        f"with a probability of {1 / count:.0%}",
+        same_parts and apart <= LARGEST_DRIFT * moved,
     )
 
 
 def _distance(one: Policy, other: Policy) -> float:
-    """Return the distance between the weights that two policies have in common."""
-    weights = dict(one.named_parameters())
-    common = [(weights[name], value) for name, value in other.named_parameters() if name in weights]
-    return math.hypot(*(float((value - same).detach().norm()) for same, value in common))
+    """Return the distance between the weights and buffers that two policies have in common."""
+    values = one.state_dict()
+    common = [(values[name], value) for name, value in other.state_dict().items() if name in values]
+    return math.hypot(*(float((value - same).float().norm()) for same, value in common))
 
 
 def _outcome(row: EpisodeRow) -> str:
@@ -213,9 +227,10 @@ def _outcome(row: EpisodeRow) -> str:
 
 def _replay_answers(subject: Subject, policies: Sequence[Policy]) -> Check:
     scenario = subject.scenario
-    _, questions = load_questions(scenario)
-    kind, asked = scored_questions(questions, scenario.budget.test_questions)
     protocol = subject.protocol
+    training, test = load_questions(scenario)
+    questions = training if protocol.split == "validation" else test  # a tuning run sees no test question
+    kind, asked = scored_questions(questions, scenario.budget.test_questions)
     again = [
         (*protocol.end(stage), *counts)
         for stage, policy in enumerate(policies)

@@ -75,6 +75,7 @@ class Subject:
             values.seed,
             values.changes,
             values.device,
+            split=values.split,
             order=values.order,
             perturb=values.perturb,
             policy=values.policy,

@@ -38,7 +38,7 @@ from clbench.runs.spec import describe_scenario
 from clbench.scoring.metrics import measure
 from clbench.spec.scenario import Scenario
 
-from ..board.runs import differences, read_run
+from ..board.runs import differences, is_number, read_run
 from ..board.summary import ELSEWHERE
 from ..board.tiers import TIERS, tier_of, verification_path, verification_text
 from ..views.files import write_all
@@ -60,6 +60,10 @@ PARTS = (
 
 _ACTORS = {"online": "an agent that learned online", "external": "a policy served from elsewhere"}
 """What acted in the runs of `ELSEWHERE`."""
+
+OTHER_TIME = 2.0
+"""Factor between two measurements of one time of a step that chance does not explain: within one method of the
+published records they differ by at most 1.59."""
 
 ORIGIN = {
     "versions": (),
@@ -271,7 +275,17 @@ def _retrain(subject: Subject, progress: ProgressCallback) -> list[Check]:
     if wrong:
         return [*before, Check("whole run", f"repeated, {', '.join(wrong)} differ", False)]
     equal = Check("whole run", f"repeated, equal in {', '.join(PARTS)}", True)
-    return [*before, equal, _check_origin(subject, again)]
+    return [*before, equal, *_check_time(subject, again), _check_origin(subject, again)]
+
+
+def _check_time(subject: Subject, again: Record) -> list[Check]:
+    """Compare the time of a step relative to plain fine-tuning's, on which the relative cost rests."""
+    theirs, ours = (record.timing.get("step_ratio") for record in (subject.run.record, again))
+    if not is_number(theirs) or not is_number(ours):
+        return []
+    alike = 1 / OTHER_TIME < theirs / ours < OTHER_TIME
+    found = f"{theirs:.2f} times that of sft in the record, {ours:.2f} here"
+    return [Check("time of a step", found, True if alike else None)]
 
 
 def _pretrain(subject: Subject, progress: ProgressCallback) -> Check:

@@ -38,7 +38,7 @@ LEGEND = (
     "± is half the width of a 95 % confidence interval; it does not cover what all seeds share: "
     "demonstrations, scenes and questions. Higher is better, except for {lower}. {tried}"
     "Bold: the best value of a division. "
-    "Cost: relative cost, the training time divided by sft's. Tier: {tiers}.\n"
+    "Cost: relative cost, the time of all optimiser steps divided by sft's. Tier: {tiers}.\n"
 )
 """Legend below the tables."""
 

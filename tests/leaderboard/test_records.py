@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import importlib
 import itertools
+import json
 import re
 import shlex
 import shutil
@@ -18,9 +19,10 @@ import pytest
 from helpers import unpacked
 
 from clbench.learning.registry import load_method, read_changes
-from clbench.records.paths import label_of, record_name, table_name, table_parts
+from clbench.records.paths import TUNING, label_of, record_name, record_path, table_name, table_parts
 from clbench.records.reader import read_record
 from clbench.runs.tuning import tuned
+from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
 from clbench.spec.policies import DEFAULT_POLICY, SMALL, policy_name
 
@@ -121,6 +123,32 @@ def test_the_rows_of_methods_have_the_settings_that_tuning_chose(board: Any) -> 
     competing = board[~board["division"].isin(["online", "reference"])]
     assert set(competing.index) <= set(tuned("clbench/Fetch-v1"))
     assert (competing["settings_tried"] == 6).all()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "methods" / "tuned").glob("*.json")), ids=lambda path: path.stem
+)
+def test_the_tuned_settings_follow_from_the_tuning_runs(path: Path) -> None:
+    content = json.loads(path.read_text(encoding="utf-8"))
+    for method, found in content["methods"].items():
+        for tried in found["tried"]:
+            label = label_of(method, tried["settings"])
+            paths = [record_path(TUNING, content["scenario"], label, seed) for seed in content["seeds"]]
+            records = [read_record(one) for one in paths]
+            if any(record.status != "success" for record in records):
+                assert tried["final_average"] is tried["learned"] is None
+                continue
+            assert all(record.run.split == "validation" for record in records)
+            scores = [Scores.from_record(record) for record in records]
+            for name, metric in (("final_average", "final_average"), ("learned", "adaptation")):
+                assert tried[name] == pytest.approx(
+                    np.mean([measure(metric, one) for one in scores]), abs=6e-5
+                )
+        learners = [tried for tried in found["tried"] if (tried["learned"] or 0.0) >= 0.8]
+        part = "final_average" if learners else "learned"
+        best = max(learners or found["tried"], key=lambda tried: tried[part] or 0.0)
+        assert found["settings"] == best["settings"]
 
 
 MISSED = {

@@ -8,11 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from eager import EAGER
 from safetensors.torch import load_file, save_file
-from verification import edit, verify
+from verification import TOY, edit, failures, verify
 
 from clbench.base.cache import MANIFEST, cached
 from clbench.evaluation.rollouts import Evaluator
+from clbench.runs.run import execute
+from clbench.runs.spec import RunSpec
 
 tiers = importlib.import_module("clbench.leaderboard.board.tiers")
 
@@ -129,3 +132,57 @@ def test_a_machine_that_cannot_tell_takes_no_tier_away(
     assert message in check.found
     assert check.passed is None
     assert tiers.tier_of(mine) == "retrained"
+
+
+@pytest.mark.long
+def test_a_stage_that_is_said_to_have_learned_its_target_earlier_is_refused(tmp_path: Path) -> None:
+    spec = RunSpec(EAGER.id, "sft", 0)
+    record = execute(spec, tmp_path / "records")
+    path = spec.path(tmp_path / "records")
+    ends = [row.step for row in record.check_rows() if row.stage == 1]
+    assert len(ends) >= 3
+
+    def end_earlier(values: dict[str, Any]) -> None:
+        """Leave out the check before the last one of stage 1, and give the last one its step."""
+        for column in values["checks"].values():
+            column.pop(len(ends) - 2)
+        values["checks"]["step"][len(ends) - 2] = ends[-2]
+        for table in ("episodes", "answers", "policy"):
+            steps = zip(values[table]["stage"], values[table]["step"], strict=True)
+            values[table]["step"] = [ends[-2] if row == (1, ends[-1]) else row[1] for row in steps]
+
+    edit(path, end_earlier)
+    found = failures(verify(path, "replayed", scenario=EAGER.id))
+    assert f"ends of stages: after [{ends[-2]}, " in found
+    assert f"trained again, after [{ends[-1]}, " in found
+    edit(path, lambda values: values["costs"].update(optimiser_steps=1))
+    assert "costs: 1 optimiser steps are fewer than" in failures(
+        verify(path, "recomputed", scenario=EAGER.id)
+    )
+
+
+@pytest.mark.long
+def test_a_tuning_run_is_verified_like_any_other(tmp_path: Path) -> None:
+    spec = RunSpec(TOY, "frozen", 100, {"step_factor": 0.3}, split="validation")
+    execute(spec, tmp_path / "records")
+    path = spec.path(tmp_path / "records")
+    assert failures(verify(path, "retrained")) == ""
+    assert tiers.tier_of(path) == "retrained"
+
+
+def test_a_test_run_with_a_tuning_seed_is_refused(tmp_path: Path) -> None:
+    spec = RunSpec(TOY, "frozen", 100)
+    execute(spec, tmp_path / "records")
+    path = spec.path(tmp_path / "records")
+    assert "seeds from 100 are for tuning" in failures(verify(path, "recomputed"))
+
+
+@pytest.mark.slow
+def test_a_step_that_is_said_to_be_much_cheaper_leaves_the_tier_open(tmp_path: Path) -> None:
+    spec = RunSpec(TOY, "l2_sp", 0)
+    execute(spec, tmp_path / "records")
+    path = spec.path(tmp_path / "records")
+    assert failures(verify(path, "retrained")) == ""
+    edit(path, lambda values: values["timing"].update(step_ratio=0.05))
+    assert "time of a step: 0.05 times that of sft in the record" in failures(verify(path, "retrained"))
+    assert tiers.tier_of(path) == "replayed"
