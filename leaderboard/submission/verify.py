@@ -62,8 +62,8 @@ _ACTORS = {"online": "an agent that learned online", "external": "a policy serve
 """What acted in the runs of `ELSEWHERE`."""
 
 OTHER_TIME = 2.0
-"""Factor between two measurements of one time of a step that chance does not explain: within one method of the
-published records they differ by at most 1.59."""
+"""Factor between two measurements of one time of a step that chance does not explain: within a method, those
+of the published records differ by at most 1.59."""
 
 ORIGIN = {
     "versions": (),
