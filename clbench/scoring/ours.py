@@ -401,7 +401,7 @@ def instruction_capture(rates: Rates) -> Array:
     "the final policy failed.",
 )
 def relearning_steps(rates: Rates) -> Array:
-    """Optimiser steps to relearn the most forgotten retained skill, after the last target."""
+    """Optimiser steps to relearn the retained skill that succeeds least, after the last target."""
     return rates.relearning_steps
 
 

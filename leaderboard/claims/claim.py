@@ -163,7 +163,7 @@ def deciding(verdict: Verdict, figures: Sequence[Figure], bar: float) -> Figure:
 
     Args:
         verdict: Verdict of the rule.
-        figures: Figures of the rule, the most important first.
+        figures: Figures of the rule, the largest first: an open rule hangs on it.
         bar: Bar of the rule.
     """
     known = [figure for figure in figures if not math.isnan(figure.low)]

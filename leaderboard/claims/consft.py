@@ -148,7 +148,7 @@ def keeps_20_points_more(evidence: Evidence) -> Finding:
             *what_controls_say(best, controls, arms),
             *at_one_says,
         ),
-        what_would_change(deciding(verdict, judged, 0.20), 0.20),
+        what_would_change(deciding(verdict, best_first(list(judged)), 0.20), 0.20),
         about=ARMS,
     )
 

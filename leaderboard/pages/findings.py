@@ -16,8 +16,9 @@ from clbench.scoring.intervals import Estimate
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.references import BASELINE, FROZEN
 
+from ..board.frontier import is_certain_over
 from ..board.predictors import predictions
-from ..board.rows import Board, Row
+from ..board.rows import Board, Row, apart_from_baseline
 from ..board.summary import WITHOUT_DEMONSTRATIONS, grouped, tables_of
 from ..claims.claim import KNOWLEDGE, PREDICATES, Claim, Verdict, tally
 from ..claims.evidence import Evidence
@@ -76,7 +77,7 @@ def sections(board: Board, judged: Sequence[Judged], evidence: Callable[[str], E
     boards = _boards(board)
     found = (
         _gains(boards, board.tied),
-        _replay(boards),
+        _replay(boards, board.tied),
         _learning_rates(board, evidence),
         Section("Is a lost skill gone?", tuple(relearning_sentences(boards))),
         _claims(judged),
@@ -114,23 +115,26 @@ def _gains(boards: dict[str, list[Row]], tied: Tied) -> Section:
     return Section(question, answers, head, lines, "gains" if lines else "")
 
 
-def _replay(boards: dict[str, list[Row]]) -> Section:
+def _replay(boards: dict[str, list[Row]], tied: Tied) -> Section:
     """What prior demonstrations buy, and what they cost."""
     answers = []
     for name, rows in boards.items():
-        usual = next((format_interval(_steps(row), ".0f") for row in rows if row.method == BASELINE), MISSING)
+        baseline = next((row for row in rows if row.method == BASELINE), None)
+        usual = f"{format_interval(_steps(baseline), '.0f')}{_never_met(baseline)}" if baseline else MISSING
+        apart = apart_from_baseline(rows)
         for row in competing(rows):
             kept = row.costs.get("bytes_kept")
             if row.division in WITHOUT_DEMONSTRATIONS or not kept:
                 continue
             gain = row.estimates["gain"]
-            moves = "gains" if gain.is_above(0) else "changes the final average by"
-            doubt = "" if gain.is_above(0) or gain.is_below(0) else ", which is not certain"
+            certain = row.method in apart and is_certain_over(tied.get(name, {}).get(row.method, ()))
+            moves = "gains" if certain and (gain.value or 0) > 0 else "changes the final average by"
+            doubt = "" if certain else ", which is not certain"
             answers.append(
                 f"On {name}, `{row.method}` {moves} {format_interval(gain)}{doubt}, keeps "
                 f"{megabytes(int(kept))} between stages, and takes "
-                f"{format_interval(_steps(row), '.0f')} steps to learn a target (plain fine-tuning: {usual})"
-                f"{_never_learned(row)}."
+                f"{format_interval(_steps(row), '.0f')} steps to learn a target{_never_met(row)} (plain "
+                f"fine-tuning: {usual})."
             )
     if answers:
         answers += [WHAT_IS_KEPT, OWN_RATES]
@@ -148,14 +152,10 @@ OWN_RATES = (
 )
 
 
-def _never_learned(row: Row) -> str:
-    """Return the end of a sentence on steps, if some stages ended without the criterion."""
+def _never_met(row: Row) -> str:
+    """Return the end of a number of steps, if some stages ended without the criterion."""
     met = row.estimates["criterion_met"].value
-    if met is None or met == 1:
-        return ""
-    return (
-        f"; {1 - met:.0%} of its stages ended without the criterion, and count with all steps of the budget"
-    )
+    return "" if met is None or met == 1 else f", with {1 - met:.0%} of the stages not meeting the criterion"
 
 
 def _steps(row: Row) -> Estimate:
@@ -304,7 +304,7 @@ def _knowledge(boards: dict[str, list[Row]]) -> Section:
         skills = ""
         if after["retention"].value is not None:
             skills = (
-                f"success on the skills falls from {format_interval(before['retention'])} to "
+                f"success on the skills goes from {format_interval(before['retention'])} to "
                 f"{format_interval(after['retention'])}, and "
             )
         answers.append(

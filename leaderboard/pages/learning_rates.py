@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
+from clbench.base.text import counted
 from clbench.spec.references import BASELINE, FROZEN
 
 from ..board.frontier import Curve, Rung
@@ -93,7 +94,8 @@ def _at_the_first_rung(
         ]
         yield (
             f"On {name}, methods without prior demonstrations keep at {rate_text(factor)}: {listed}. The "
-            f"first of them, `{falling[0]}`, keeps {' and '.join(over)}."
+            f"first of them, `{falling[0]}`, keeps {' and '.join(over)}; it was chosen as the best of "
+            f"{len(falling)} on the same episodes, and the rate as above."
         )
 
 
@@ -112,9 +114,10 @@ def _of_frozen(name: str, baseline: Curve, rows: Sequence[Row], evidence: Eviden
     for row in rows:
         if row.method == FROZEN:
             best = _best(baseline)
+            more = evidence.difference("kept", rung(BASELINE, best.factor), FROZEN)
             yield (
                 f"On {name}, `{FROZEN}`, which learns nothing, keeps "
                 f"{format_interval(row.estimates['kept'])} by this measure: a target that was never learned "
-                f"counts as not kept. Plain fine-tuning at {rate_text(best.factor)} keeps "
-                f"{_kept_more(evidence, rung(BASELINE, best.factor), FROZEN)} more, seed by seed."
+                f"counts as not kept. Plain fine-tuning at {rate_text(best.factor)}, chosen as above, keeps "
+                f"{format_interval(more.estimate)} more ({counted(len(more.seeds), 'seed')}, seed by seed)."
             )

@@ -39,12 +39,18 @@ def relearning_sentences(boards: Mapping[str, Sequence[Row]]) -> list[str]:
         answers.append(
             f"On {name}, plain fine-tuning loses a skill in {len(lost)} of {seeds} (most lost: "
             f"{_skills(lost)}). It meets the criterion again after {_steps(lost)} steps on its "
-            "demonstrations."
+            f"demonstrations{_never_again(lost)}."
             f"{_without_pretraining(by_method.get(FROM_SCRATCH), lost)}"
         )
     if answers:
         answers.insert(0, LOST_MEANS)
     return answers
+
+
+def _never_again(lost: Sequence[Relearning]) -> str:
+    """Return the end of a sentence on steps to relearn, if some runs ended without the criterion."""
+    count = sum(not one.met for one in lost)
+    return f"; {count} of the {len(lost)} never did, and count with all steps of a stage" if count else ""
 
 
 def _measured(row: Row | None) -> list[tuple[Relearning, float]]:

@@ -212,7 +212,7 @@ def _keeping(members: Sequence[Row], baseline: Row | None) -> str:
         other = f"The other, {name}," if len(members) == 2 else f"Of the others, {name}"
         which = "It" if keeper is leader else other
         return f"{slower}{which} {_beside(keeper, baseline)} {_training(keeper, baseline, whose)}"
-    kept, like = _value("kept", keeper), "Of the methods that learn about as much as sft"
+    kept, like = _value("kept", keeper), "Of the methods not told apart from sft in what they learn"
     if keeper.method == BASELINE:
         return f"{slower}{like}, none keeps more than sft itself ({kept})."
     peers = _alike("kept", keeper.method, {row.method: row for row in equal})

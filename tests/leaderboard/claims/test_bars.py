@@ -250,6 +250,14 @@ def test_what_would_change_a_verdict_is_the_figure_nearest_to_the_bar() -> None:
     assert '"retained success, consft_calibrated@1 - sft@1" would have to move by 0.00' in finding.change
 
 
+def test_an_undecided_verdict_hangs_on_the_largest_figure_that_is_open() -> None:
+    best = kept((-0.19, 0.29), (-0.1, 0.05))
+    at_one = kept(LESS, (-0.09, 0.62), rung="@1")
+    finding = judged("C2", {**BOTH, **SFT, **best, **at_one})
+    assert finding.verdict == "undecided"
+    assert '"retained success, consft_calibrated@1 - sft@1"' in finding.change
+
+
 @pytest.mark.parametrize(
     ("identifier", "given", "named"),
     [

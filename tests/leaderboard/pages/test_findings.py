@@ -1,5 +1,6 @@
 """The findings say what the records show: every sentence follows from made-up records."""
 
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -7,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from helpers import sealed
 
 from clbench.base.entry_points import resolve
 from clbench.records.paths import record_path
@@ -215,6 +217,42 @@ def test_how_fast_lost_skills_come_back_is_told_with_their_names(
     assert told == (other == "skill_1"), "another skill says nothing of this one"
 
 
+def test_a_skill_that_does_not_come_back_is_said_to_be_gone(
+    make_record: Callable[..., Record], tmp_path: Path, page: Callable[[], str]
+) -> None:
+    for seed in range(3):
+        record = make_record(
+            [[1, 1, 0, 0, 0], [0, 0, 0.9, 0, 0], [0, 0, 0, 0.9, 0]],
+            method="sft",
+            seed=seed,
+            scenario="clbench/Even-v1",
+            steps=(20,),
+            ends=(8, 20),
+            relearning=Relearning("skill_1", 0, 20 if seed else 8, not seed),
+        )
+        write_record(record, record_path(tmp_path / "records", "clbench/Even-v1", "sft", seed))
+    assert "; 2 of the 3 never did, and count with all steps of a stage." in page()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("kept", "certain"), [(0.5, False), (0.9, True)])
+def test_a_gain_of_replay_is_certain_only_if_the_test_tells_it_apart(
+    kept: float, certain: bool, even_board: Callable[..., Path], page: Callable[[], str]
+) -> None:
+    for seed, luck in enumerate((0.02, -0.02, 0.06, -0.02)):
+        even_board("sft", seed, 0.4)
+        records = even_board("experience_replay", seed, kept + luck)
+    for path in records.rglob("*.json"):
+        values = json.loads(path.read_text(encoding="utf-8"))
+        if values["run"]["method"] != "sft":
+            values["costs"]["bytes_kept"] = 1000
+            values["run"]["uses"]["demonstrations"] = "throughout"
+        path.write_text(json.dumps(sealed(values)), encoding="utf-8")
+    told = re.search(r"`experience_replay` (gains|changes the final average by) 0\.\d+ \[0\.(?!00).*", page())
+    assert told, "its own interval is above 0"
+    assert (told[1] == "gains") == ("not certain" not in told[0]) == certain
+
+
 @pytest.mark.long
 def test_definitions_that_order_the_methods_alike_have_a_tau_of_one(
     even_board: Callable[..., Path], page: Callable[[], str]
@@ -246,7 +284,7 @@ def test_boards_with_a_fixed_number_of_steps_also_tell_what_is_lost_of_skills_an
     output = tmp_path / "findings.md"
     findings(records=tmp_path / "leaderboard/records", controls=tmp_path / "controls", output=output)
     section = output.read_text(encoding="utf-8").partition("## Are skills and knowledge lost together?")[2]
-    assert "On clbench/Toy-v0, where stages have a fixed length, success on the skills falls from " in section
+    assert "On clbench/Toy-v0, where stages have a fixed length, success on the skills goes from " in section
     assert re.search(r"and the share of right answers goes from 0\.\d\d .* to 0\.50", section)  # 25 of 50
 
 

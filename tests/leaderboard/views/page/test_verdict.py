@@ -118,8 +118,8 @@ def test_a_leader_that_is_not_told_apart_is_said_to_be_so(board: Callable[..., A
         f"In final average ({final:.2f}) it is first of 3; 2 are not told apart from it: lora and sft."
     )
     assert verdict.keeping == (
-        "Of the methods that learn about as much as sft, it keeps the most (0.60), but is not told "
-        "apart from sft (0.50) in this. Its training time was not measured."
+        "Of the methods not told apart from sft in what they learn, it keeps the most (0.60), but is not "
+        "told apart from sft (0.50) in this. Its training time was not measured."
     )
 
 
@@ -132,7 +132,7 @@ def test_the_one_method_that_is_not_told_apart_from_a_leader_is_named(board: Cal
 def test_no_method_keeps_more_than_plain_fine_tuning(board: Callable[..., Any]) -> None:
     (verdict,) = verdicts(board(sft=matrix(0.9), lora=matrix(0.2), finch=matrix(0.1)))
     assert verdict.keeping == (
-        "Of the methods that learn about as much as sft, none keeps more than sft itself (0.90)."
+        "Of the methods not told apart from sft in what they learn, none keeps more than sft itself (0.90)."
     )
 
 
@@ -141,7 +141,7 @@ def test_a_leader_that_is_told_apart_from_all_is_said_to_be_so(board: Callable[.
     assert verdict.leader.method == "lora"
     assert verdict.standing.endswith("it is first of 3, told apart from all others of its division.")
     assert verdict.keeping == (
-        "Of the methods that learn about as much as sft, it keeps the most (0.90). Its training "
+        "Of the methods not told apart from sft in what they learn, it keeps the most (0.90). Its training "
         "time was not measured."
     )
 
@@ -187,8 +187,8 @@ def test_a_leader_that_learns_less_does_not_keep_most_of_those_that_learn_alike(
     (verdict,) = verdicts(board(sft=matrix(0.1), lora=matrix(1.0, 0.3), finch=matrix(0.2)))
     assert verdict.leader.method == "lora"
     assert (
-        "It learns less than sft: 0.30 against 1.00. Of the methods that learn about as much as "
-        "sft, finch keeps the most (0.20)" in verdict.keeping
+        "It learns less than sft: 0.30 against 1.00. Of the methods not told apart from sft in what "
+        "they learn, finch keeps the most (0.20)" in verdict.keeping
     )
 
 
