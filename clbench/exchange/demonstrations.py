@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Literal, get_args
+
+import numpy as np
 
 from clbench.base.cache import cached
 from clbench.base.dependencies import require
@@ -32,6 +35,8 @@ from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 
+LOG = logging.getLogger("clbench")
+
 Format = Literal["lerobot", "hdf5"]
 """Format of exported demonstrations: one LeRobotDataset, or one HDF5 file for each task."""
 
@@ -45,6 +50,8 @@ def export_demonstrations(
     noisy: bool = True,
 ) -> Path:
     """Export demonstrations, which are collected on first use, and return the folder that holds them.
+
+    A warning names the numbers of the actions that never change in the export.
 
     Args:
         scenario: Scenario, or its Gymnasium id.
@@ -69,7 +76,9 @@ def export_demonstrations(
     found = {task: read_dataset(dataset_folder(task, loaded.budget)) for task in chosen}
     if not noisy:
         found = {task: _without_noise(task, episodes) for task, episodes in found.items()}
-    return _in_one_step(folder, lambda partial: _WRITERS[format](partial, found))
+    exported = _in_one_step(folder, lambda partial: _WRITERS[format](partial, found))
+    _warn_if_constant(found.values())
+    return exported
 
 
 def chosen_tasks(scenario: Scenario | str, tasks: Iterable[str]) -> tuple[Scenario, list[Task]]:
@@ -109,6 +118,22 @@ def _without_noise(task: Task, episodes: Sequence[Demonstration]) -> list[Demons
     if not clean:
         raise InputError(f"All {counted(len(episodes), 'demonstration')} of {task.name} have action noise.")
     return clean
+
+
+def _warn_if_constant(tasks: Iterable[Sequence[Demonstration]]) -> None:
+    """Name the numbers of the actions that never change: libraries scale a policy's actions by the deviation.
+
+    It is 0 then, and the policy returns the mean, whatever its weights are.
+    """
+    actions = np.concatenate([episode.expert[:-1] for episodes in tasks for episode in episodes])
+    constant = np.flatnonzero(np.ptp(actions, axis=0) == 0)
+    if constant.size:
+        LOG.warning(
+            "These numbers of the actions are the same in every step of this export: %s, counted from 0. A "
+            "policy that is normalised with the statistics of this export alone can return no other values: "
+            "docs/guide/external.md#normalise-all-stages-alike shows what to do.",
+            ", ".join(map(str, constant)),
+        )
 
 
 def _write_files(folder: Path, tasks: Mapping[Task, Sequence[Demonstration]]) -> None:

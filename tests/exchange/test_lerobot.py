@@ -273,6 +273,19 @@ def test_episodes_with_action_noise_can_be_left_out(tmp_path: Path, episodes: li
     assert not rows["noisy"].any()
 
 
+def test_an_export_names_the_numbers_of_the_actions_that_never_change(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for kind, tasks, constant in (("lerobot", "left", "0, 1"), ("hdf5", ("left", "right"), "1")):
+        export_demonstrations(TOY, tmp_path / kind, format=kind, tasks=tasks)  # type: ignore[arg-type]
+        (message,) = caplog.messages
+        assert f"the same in every step of this export: {constant}, counted from 0" in message
+        assert "docs/guide/external.md#normalise-all-stages-alike" in message
+        caplog.clear()
+    export_demonstrations(TOY, tmp_path / "all", format="lerobot")
+    assert caplog.messages == []
+
+
 def test_a_task_whose_episodes_all_have_action_noise_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, episodes: list[Demonstration]
 ) -> None:
