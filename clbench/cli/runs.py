@@ -161,7 +161,8 @@ def score(
         policy: Address of the server, ws://host:port. docs/guide/external.md shows how to serve a policy.
         stage: Stage after which the policy is evaluated.
         method: Name of the row on the leaderboard, for example me/lora.
-        seed: Seed of the run. It chooses the initial states, the same for all methods.
+        seed: Seed of the run. It chooses the initial states, the same for all methods. From 100 on, the
+            command plays validation episodes, on which you may choose settings.
         executed: Actions of each chunk that are executed before the policy acts again (default: all). The
             number is the same in all stages.
         data: What the policy was trained on in this stage, in words. The record keeps it.
@@ -211,8 +212,10 @@ def score(
             f"Stages so far: {path}{UNFINISHED}\n"
             f"Next: fine-tune on {targets[stage]}, serve the policy, and score it with --stage {stage + 1}."
         )
-    else:
+    elif record.run.split == "test":
         then = f"Record: {path}\n{_next(records)}"
+    else:
+        then = f"Record: {path}\nIt is a tuning run, on validation episodes: no board shows it."
     print_plain(console, then)
 
 

@@ -39,7 +39,7 @@ from clbench.records.writer import write_record
 from clbench.runs.fingerprint import fingerprint
 from clbench.runs.spec import describe_scenario
 from clbench.spec.identifiers import built_in_methods, check_method_name
-from clbench.spec.protocol import LARGEST_SEED, Protocol
+from clbench.spec.protocol import FIRST_TUNING_SEED, LARGEST_SEED, Protocol, ScoredSplit
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
 from clbench.worlds.schedule import is_whole, whole_number
@@ -79,7 +79,8 @@ def evaluate_agent(
             side, of Gymnasium or of Stable-Baselines3. It gives the scenario, the stage, the format of
             instructions and the number of environment steps.
         method: Name of the agent's row on the leaderboard, for example "me/sac".
-        seed: Seed of the run; it chooses the initial states, the same for all methods.
+        seed: Seed of the run; it chooses the initial states, the same for all methods. From 100 on,
+            validation episodes are played.
         steps: Number of environment steps in the stage, if they were not taken in `env` itself.
         settings: Settings of the agent that readers should know, as JSON; the same in all stages.
         batched: Whether `predict` gets the observations of 40 episodes at once, arrays (40, ...) by name, and
@@ -88,7 +89,7 @@ def evaluate_agent(
         records: Folder of the records.
 
     Returns:
-        The record so far. Its scores come from test episodes, so base no choice on them.
+        The record so far. Base no choice on test episodes: choose with a seed from 100 on.
 
     Raises:
         WrongTypeError: `env` is not an environment of a scenario, or `agent` cannot act.
@@ -190,6 +191,11 @@ class StagedRun:
     def last(self) -> int:
         """Number of the last stage."""
         return len(self.scenario.target)
+
+    @property
+    def split(self) -> ScoredSplit:
+        """Split that is scored: all seeds share the test wordings, on which no setting may be chosen."""
+        return "validation" if self.seed >= FIRST_TUNING_SEED else "test"
 
     @cached_property
     def path(self) -> Path:
@@ -347,7 +353,7 @@ class StagedRun:
             method=self.method,
             seed=self.seed,
             device=str(getattr(agent, "device", "unknown")),
-            split="test",
+            split=self.split,
             settings=settings,
             changes={},
             uses=dict(self.uses),
@@ -360,7 +366,7 @@ class StagedRun:
     @cached_property
     def _protocol(self) -> Protocol:
         """The protocol that every run follows."""
-        return describe_scenario(self.scenario).protocol()
+        return describe_scenario(self.scenario).protocol(self.split)
 
     def trials(self, stage: int) -> list[Trial]:
         """Return the episodes that every run plays at the end of a stage."""

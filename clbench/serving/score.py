@@ -100,7 +100,8 @@ def score(
             numbers of its attribute `metadata`, which a `ServedPolicy` has from its server.
         stage: Stage after whose fine-tuning the policy is evaluated; 0 is before the first target.
         method: Name of the row on the leaderboard, for example "me/lora".
-        seed: Seed of the run; it chooses the initial states, the same for all methods.
+        seed: Seed of the run; it chooses the initial states, the same for all methods. From 100 on,
+            validation episodes are played.
         executed: Actions of a chunk that are executed before the policy acts again, the same number in all
             stages. If None, all: chunks must then have one length in all stages.
         data: What the policy was trained on in this stage, in words.
@@ -110,7 +111,7 @@ def score(
         progress: Called with the share of the stage's episodes that have ended since its last call.
 
     Returns:
-        The record so far. Its scores come from test episodes: base no choice on them.
+        The record so far. Base no choice on test episodes: choose with a seed from 100 on.
 
     Raises:
         InputError: Another stage comes next, a record exists already, `executed` is not that of stage 0, the

@@ -93,6 +93,19 @@ def test_an_agent_has_the_same_initial_states_as_every_method(
     assert {(name, seed) for seeds, names in seen for seed, name in zip(seeds, names, strict=True)} == starts
 
 
+def test_an_agent_with_a_tuning_seed_plays_validation_episodes(
+    evaluate: Callable[..., Any], tmp_path: Path
+) -> None:
+    for stage, known in enumerate(LEARNED):
+        record = evaluate(Knowing(*known), stage_env(stage), seed=100)
+    assert record.run.split == "validation"
+    assert set(record.episodes["split"]) == {"validation"}
+    assert read_record(tmp_path / "records" / "Toy-v0" / "me--knows" / "seed-100.json") == record
+    scores = Scores.from_record(record)
+    assert scores.success.shape[-1] == TOY.budget.validation_episodes
+    assert measure("adaptation", scores) == 1.0
+
+
 def test_a_function_is_an_agent_and_observes_what_its_env_returns(evaluate: Callable[..., Any]) -> None:
     env = stage_env(0, instruction="tokens")
     seen: list[bool] = []

@@ -32,6 +32,16 @@ def test_what_a_record_cannot_mean_is_refused(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(("seed", "split"), [(99, "test"), (100, "validation")])
+def test_settings_are_chosen_on_validation_episodes_with_a_tuning_seed(
+    seed: int, split: str, tmp_path: Path
+) -> None:
+    record = score(ID, _still, stage=0, method="me/still", seed=seed, records=tmp_path)
+    assert record.run.split == split
+    assert set(record.episodes["split"]) == {split}
+    assert record.matrix().notna().all(axis=None)
+
+
 def test_numbers_of_numpy_are_recorded_as_numbers(tmp_path: Path) -> None:
     numbers: Any = {"stage": np.int64(0), "executed": np.int64(2), "steps": np.int64(5)}
     record = score(ID, _still, method="me/still", records=tmp_path, **numbers)

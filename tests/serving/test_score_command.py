@@ -8,6 +8,7 @@ from agents import ID
 from served import serving, write_policy
 
 from clbench.base.entry_points import resolve
+from clbench.serving.score import score
 
 STAGES = range(3)
 
@@ -60,6 +61,21 @@ def test_the_command_refuses_what_contradicts_a_done_stage_and_scores_it_again_i
     capsys.readouterr()
     command(ID, **options, executed=2)
     assert "is done" in capsys.readouterr().err
+
+
+@pytest.mark.long
+def test_the_command_says_that_no_board_shows_a_tuning_seed(
+    tmp_path: Path, empty_caches: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policy_of = write_policy(tmp_path)
+    options: dict[str, Any] = {"method": "me/elsewhere", "seed": 100, "records": tmp_path / "records"}
+    for stage in STAGES[:2]:
+        score(ID, policy_of(stage), stage=stage, **options)
+    with serving(tmp_path, 2) as (address, _):
+        resolve("clbench.cli.runs:score")(ID, policy=address, stage=2, **options)
+    shown = capsys.readouterr().err
+    assert "It is a tuning run, on validation episodes: no board shows it." in shown
+    assert "Next:" not in shown
 
 
 @pytest.mark.parametrize(
