@@ -15,7 +15,9 @@ of each episode. Its observations are a dictionary:
 - `seed`: int64 (B,), a seed for each episode, and `step`: int64 (B,), the steps taken in it. Draw noise from
   both alone, and the outcomes repeat themselves.
 
-Rows are independent: an episode has no fixed row, and unused rows repeat the first one.
+Rows are independent: an episode has no fixed row, and unused rows repeat the first one. A policy with a
+memory keeps it by `seed`, which names the episode, and returns one action at a time; `step` 0 begins an
+episode.
 
 The protocol is openpi's. The first message is the metadata of the server. Then each request is a dictionary
 of observations, and each reply one with `actions`. All are msgpack, with arrays as in openpi's
@@ -77,8 +79,8 @@ def lerobot_policy(
     reply, but the noise of an episode depends on the other ones in its request.
 
     Args:
-        policy: A `PreTrainedPolicy` whose `predict_action_chunk` needs no earlier observations: ACT, SmolVLA,
-            pi0 and others, but not the diffusion policy with its history.
+        policy: A `PreTrainedPolicy` whose `predict_action_chunk` needs no earlier observations: ACT, or
+            SmolVLA, pi0 and others, which were not tried, but not the diffusion policy with its history.
         preprocess: The preprocessor of `lerobot.policies.factory.make_pre_post_processors`.
         postprocess: The postprocessor of the same function.
         camera: Name of the camera in the policy's features, "image" in demonstrations that clbench exported.
@@ -116,10 +118,10 @@ def openpi_policy(
     observation: Callable[[Observations], Observations] = _openpi_observation,
     noise: tuple[int, int] | None = None,
 ) -> Policy:
-    """Return a policy of openpi as a function of observations; it infers one episode after another.
+    """Return a policy that takes one observation at a time, such as openpi's, as a function of observations.
 
-    There is one camera at most, and the state is that of the scenario. The policy's input transform must not
-    ask for more: openpi's `LiberoInputs` does, for a picture of the wrist.
+    Nothing of openpi is needed. There is one camera at most, and the state is that of the scenario. The
+    policy's input transform must not ask for more: openpi's `LiberoInputs` does, for a picture of the wrist.
 
     Args:
         policy: A policy whose `infer(observation)` returns a dictionary with `actions`, (H, A).
@@ -158,7 +160,8 @@ def serve(
     Programs on this machine can use the policy, but no page in a browser.
 
     Args:
-        policy: The policy. It is called by one request at a time.
+        policy: The policy. It is called by one request at a time, in another thread: what holds for one
+            thread alone, such as `torch.inference_mode()` and `torch.autocast()`, belongs inside it.
         host: Address to listen on. "0.0.0.0" lets any machine that reaches this one use the policy.
         port: Port to listen on; 0 lets the system choose one, which is printed.
         metadata: What clients receive first, texts and numbers, for example the name of a checkpoint.

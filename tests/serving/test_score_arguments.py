@@ -1,4 +1,4 @@
-"""`score` in Python: what it refuses before an episode is played."""
+"""`score` in Python: what it refuses before an episode is played, and what a policy may rely on."""
 
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,19 @@ def test_settings_are_chosen_on_validation_episodes_with_a_tuning_seed(
     assert record.run.split == split
     assert set(record.episodes["split"]) == {split}
     assert record.matrix().notna().all(axis=None)
+
+
+def test_a_policy_with_a_memory_sees_every_step_of_an_episode_under_its_seed(tmp_path: Path) -> None:
+    seen: dict[int, list[int]] = {}
+
+    def act(observations: dict[str, Any]) -> Any:
+        for seed, step in {*zip(observations["seed"].tolist(), observations["step"].tolist(), strict=True)}:
+            seen.setdefault(seed, []).append(step)
+        return np.zeros((40, 1, 2))
+
+    record = score(ID, act, stage=0, method="me/still", records=tmp_path)
+    assert sorted(map(len, seen.values())) == sorted(record.episodes["length"])
+    assert all(steps == list(range(len(steps))) for steps in seen.values())
 
 
 def test_numbers_of_numpy_are_recorded_as_numbers(tmp_path: Path) -> None:
