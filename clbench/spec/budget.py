@@ -19,9 +19,9 @@ class Budget:
     demonstrations: int = 200
     """Expert episodes per task."""
     noisy_demonstrations: float = 0.5
-    """Share of the expert's attempts with action noise, from 0 to 1: some executed actions are random, while
-    the recorded ones stay the expert's. Failed attempts are dropped, and more of those with noise fail, so of
-    the demonstrations of a hard task fewer have it: 0.36 of pick and place on Fetch-v1, instead of 0.5."""
+    """Share of the expert's attempts that may have action noise, from 0 to 1: some executed actions are
+    random, while the recorded ones stay the expert's. The noise begins at random, with the task's probability
+    in each step, and failed attempts are dropped: on Fetch-v1, 0.24 of the demonstrations contain some."""
     question_episodes: int = 200
     """Episodes that give the states of the training questions; the test questions get a quarter as many."""
     test_questions: int = 1000
