@@ -51,11 +51,15 @@ def pieces() -> tuple[str, ...]:
 
 
 @cache
-def _tokenizer(length: int) -> Tokenizer:
+def _ids() -> dict[str, int]:
     ids = {word: number for number, word in enumerate(vocabulary())}
     # counted from the end: new words do not move them
-    ids |= {piece: VOCABULARY_SIZE - 1 - number for number, piece in enumerate(pieces())}
-    tokenizer = Tokenizer(models.WordPiece(ids, unk_token=PADDING))
+    return ids | {piece: VOCABULARY_SIZE - 1 - number for number, piece in enumerate(pieces())}
+
+
+@cache
+def _tokenizer(length: int) -> Tokenizer:
+    tokenizer = Tokenizer(models.WordPiece(_ids(), unk_token=PADDING))
     tokenizer.normalizer = normalizers.Sequence(
         [normalizers.NFKD(), normalizers.StripAccents(), normalizers.Lowercase()]
     )
@@ -97,6 +101,15 @@ def word_ids(texts: Sequence[str], length: int = TEXT_LENGTH) -> list[list[int]]
             )
         rows.append(encoding.ids)
     return rows
+
+
+def decode(words: Tensor) -> list[str]:
+    """Return the texts of word ids (B, L), for a policy with a tokenizer of its own.
+
+    They are in lower case, and without accents and punctuation.
+    """
+    tokens = {number: token for token, number in _ids().items()}
+    return [" ".join(tokens[one] for one in row if one).replace(" ##", "") for row in words.tolist()]
 
 
 @lru_cache(maxsize=64)

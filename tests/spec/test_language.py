@@ -8,6 +8,7 @@ from clbench.spec.language import (
     TEXT_LENGTH,
     VOCABULARY_SIZE,
     UnknownWordError,
+    decode,
     encode,
     fitting_length,
     pieces,
@@ -52,6 +53,20 @@ def test_any_english_word_can_be_read_back_from_its_tokens(words: list[str]) -> 
 def test_pieces_and_words_share_no_id() -> None:
     assert len(set(pieces())) == len(pieces()) <= VOCABULARY_SIZE - len(vocabulary())
     assert all(piece.startswith("##") or piece not in vocabulary() for piece in pieces())
+
+
+def test_texts_are_read_back_without_case_accents_and_punctuation() -> None:
+    assert decode(encode(["Push the block, please!", "the zoning zebra-caf\u00e9"])) == [
+        "push the block please",
+        "the zoning zebra cafe",
+    ]
+
+
+@given(
+    st.lists(st.text("abcdefghijklmnopqrstuvwxyz0123456789", min_size=1, max_size=5), min_size=1, max_size=9)
+)
+def test_any_english_text_can_be_read_back_from_its_ids(words: list[str]) -> None:
+    assert decode(encode([" ".join(words)], LENGTHS[-1])) == [" ".join(words)]
 
 
 def test_a_word_of_other_letters_is_named() -> None:
