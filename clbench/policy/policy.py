@@ -184,7 +184,7 @@ class Policy(nn.Module, ABC):
 
 @contextmanager
 def evaluating(policy: Policy) -> Iterator[None]:
-    """Put a policy into evaluation mode inside the block: no dropout draws, and no batch norm learns."""
+    """Put a policy into evaluation mode inside the block, and then back into the mode that it had."""
     training = policy.training
     policy.eval()
     try:

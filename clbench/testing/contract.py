@@ -63,7 +63,8 @@ def check_method(cls: type[Method], *, policy: str = DEFAULT_POLICY, **settings:
 
     Args:
         cls: Class of the method.
-        policy: Name of the policy that it fine-tunes: "flow" or "discrete_diffusion".
+        policy: Name of the policy that it fine-tunes: "flow", "discrete_diffusion", or "module:Class" for one
+            of your own.
         settings: Hyper-parameters that differ from its defaults, to shorten a long preparation.
 
     Raises:

@@ -49,6 +49,9 @@ PAGE = "docs/guide/your_policy.md"
 def check_policy(kind: str, image_size: int = 0) -> None:
     """Check on the toy's data that a policy keeps the protocol of `clbench.Policy`.
 
+    The policy is built with the toy's sizes and normalised like its demonstrations: a class that loads
+    pretrained weights must go without them here.
+
     Args:
         kind: Kind of the policy: a built-in name, or "module:Class".
         image_size: Width and height of the pictures that it sees, such as 64 for `clbench/FetchPixels-v0`; 0
@@ -162,7 +165,7 @@ def losses(subject: Subject) -> None:
     if not bool(torch.isfinite(loss).all()):
         raise _breach(losses, "finite losses", str(loss.tolist()), "action_loss()")
     if not loss.equal(policy.action_loss(batch)):
-        expected = "equal losses on the same batch: all draws come with it, in `draw` and `noise`"
+        expected = "equal losses on the same batch: all draws come with it, in `draw` and `noise`; no dropout"
         raise _breach(losses, expected, "other losses at the second call", "action_loss()")
     for row in range(SAMPLES):
         alone = policy.action_loss(batch[row : row + 1])

@@ -114,6 +114,13 @@ class Drawing(Base):
         return loss * (1 + torch.rand_like(loss))
 
 
+class Dropping(Plain):
+    """Has dropout, which its evaluation leaves out."""
+
+    def chunk(self, state: Tensor, words: Tensor) -> Tensor:
+        return F.dropout(super().chunk(state, words), training=self.training)
+
+
 class Normalising(Base):
     """Divides the losses by their mean."""
 
@@ -283,6 +290,7 @@ BROKEN: list[tuple[type[Policy], str, str]] = [
     (Constant, "initial weights", "seeds 1 and 2 give the same weights"),
     (Together, "losses", r"tensor of shape \(6,\)\n  found:    \(\)"),
     (Drawing, "losses", "other losses at the second call"),
+    (Dropping, "losses", "in `draw` and `noise`; no dropout"),
     (Normalising, "losses", "alone"),
     (Padded, "losses", "does not depend on `valid`"),
     (Detached, "gradients", "none that is not 0"),
@@ -343,6 +351,13 @@ def test_what_is_no_policy_is_refused_by_name(kind: str, error: type[Exception],
 def test_every_broken_policy_is_one_by_its_clause_alone() -> None:
     """The class that they derive from keeps the contract: what the checks find is the change."""
     check_policy(f"{__name__}:Base")
+
+
+@pytest.mark.long
+def test_a_method_is_checked_on_a_policy_of_ones_own() -> None:
+    check_method(load_method("sft"), policy=f"{__name__}:Plain")
+    with pytest.raises(ContractError, match="Plain does not have the ability 'hidden_states'"):
+        check_method(load_method("aegis"), policy=f"{__name__}:Plain")
 
 
 @dataclass
