@@ -67,16 +67,20 @@ _DTYPE = re.compile(r"[<>=|]?[A-Za-z?]{1,16}\d{0,10}(?:\[\w{1,16}\])?", re.ASCII
 
 
 def lerobot_policy(
-    policy: Any, preprocess: Callable[[Any], Any], postprocess: Callable[[Any], Any], camera: str = "image"
+    policy: Any,
+    preprocess: Callable[[Any], Any],
+    postprocess: Callable[[Any], Any],
+    camera: str = "image",
+    noise: tuple[int, int] | None = None,
 ) -> Policy:
     """Return a policy of LeRobot as a function of observations.
 
     The batch that `preprocess` receives has `observation.state`, float32 (B, S), `task`, a list of B texts,
     and with a camera `observation.images.<camera>`, float32 (B, 3, N, N) from 0 to 1. Without a camera it has
     the state as `observation.environment_state`, too: ACT refuses to go without both. `postprocess` receives
-    the actions (B, A) of one step after another, as in LeRobot's own server. Noise is drawn from PyTorch's
-    generator, which is seeded before each call by all seeds and steps together: the same request has the same
-    reply, but the noise of an episode depends on the other ones in its request.
+    the actions (B, A) of one step after another, as in LeRobot's own server. Without `noise`, a policy draws
+    from PyTorch's generator, which is seeded before each call by all seeds and steps together: the same
+    request has the same reply, but the noise of an episode depends on the other ones in its request.
 
     Args:
         policy: A `PreTrainedPolicy` whose `predict_action_chunk` needs no earlier observations: ACT, or
@@ -84,6 +88,8 @@ def lerobot_policy(
         preprocess: The preprocessor of `lerobot.policies.factory.make_pre_post_processors`.
         postprocess: The postprocessor of the same function.
         camera: Name of the camera in the policy's features, "image" in demonstrations that clbench exported.
+        noise: Shape of the noise that `predict_action_chunk(batch, noise=...)` starts from, as for
+            `openpi_policy`: `(policy.config.chunk_size, policy.config.max_action_dim)` for SmolVLA and pi0.
     """
     import torch  # LeRobot brings it
 
@@ -96,8 +102,13 @@ def lerobot_policy(
         else:
             batch["observation.environment_state"] = state
         torch.manual_seed(int(observations["seed"].sum() + observations["step"].sum()))
+        drawn = {}
+        if noise is not None:
+            rows = zip(observations["seed"], observations["step"], strict=True)
+            values = torch.from_numpy(np.stack([_noise(seed, step, noise) for seed, step in rows]))
+            drawn["noise"] = values.to(next(policy.parameters()).device)
         with torch.no_grad():
-            chunks = policy.predict_action_chunk(preprocess(batch))
+            chunks = policy.predict_action_chunk(preprocess(batch), **drawn)
             # LeRobot executes so many actions of a chunk, then the policy acts again
             executed = getattr(policy.config, "n_action_steps", chunks.shape[1])
             steps = [postprocess(chunks[:, step]) for step in range(min(executed, chunks.shape[1]))]
@@ -105,6 +116,11 @@ def lerobot_policy(
         return actions
 
     return act
+
+
+def _noise(seed: Any, step: Any, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Return the noise that an episode starts a chunk from."""
+    return np.random.default_rng([int(seed), int(step)]).standard_normal(shape, np.float32)
 
 
 def _openpi_observation(row: Observations) -> Observations:
@@ -133,10 +149,7 @@ def openpi_policy(
     """
 
     def infer(row: Observations) -> Any:
-        drawn = {}
-        if noise is not None:
-            generator = np.random.default_rng([int(row["seed"]), int(row["step"])])
-            drawn["noise"] = generator.standard_normal(noise, np.float32)
+        drawn = {} if noise is None else {"noise": _noise(row["seed"], row["step"], noise)}
         return policy.infer(observation(row), **drawn)["actions"]
 
     def act(observations: Observations) -> NDArray[Any]:

@@ -259,6 +259,7 @@ class LeRobotShaped:
 
     def __init__(self, noise: float = 0.0, executed: int = 5) -> None:
         self.batches: list[dict[str, Any]] = []
+        self.given: list[torch.Tensor] = []
         self.noise = noise
         self.config = SimpleNamespace(n_action_steps=executed)
 
@@ -266,7 +267,11 @@ class LeRobotShaped:
         self.batches.append(batch)
         return {**batch, "observation.state": batch["observation.state"] - 1}
 
-    def predict_action_chunk(self, batch: dict[str, Any]) -> torch.Tensor:
+    def parameters(self) -> Iterator[torch.Tensor]:
+        yield torch.zeros(1)
+
+    def predict_action_chunk(self, batch: dict[str, Any], **noise: torch.Tensor) -> torch.Tensor:
+        self.given += noise.values()
         state = batch["observation.state"][:, None, :2]
         chunks: torch.Tensor = state + torch.arange(5.0)[:, None] + self.noise * torch.randn(len(state), 5, 2)
         return chunks
@@ -317,6 +322,19 @@ def test_a_policy_of_lerobot_draws_the_same_noise_for_the_same_request() -> None
         later = act({**OBSERVATIONS, "step": np.array([4, 8])})
     assert np.array_equal(first, again)
     assert not np.array_equal(first, later)
+
+
+def test_noise_of_a_policy_of_lerobot_depends_on_the_seed_and_the_step_of_its_episode_alone() -> None:
+    policy = LeRobotShaped()
+    act = lerobot_policy(policy, policy.preprocess, policy.postprocess, noise=(5, 8))
+    with torch.random.fork_rng():
+        act(OBSERVATIONS)
+        act({**OBSERVATIONS, "seed": np.array([7, 6])})  # another first episode
+        act({**OBSERVATIONS, "step": np.array([0, 9])})
+    first, beside, later = policy.given
+    assert (first.shape, first.dtype) == ((2, 5, 8), torch.float32)
+    assert [first[row].equal(beside[row]) for row in (0, 1)] == [False, True]
+    assert [first[row].equal(later[row]) for row in (0, 1)] == [True, False]
 
 
 class OpenpiShaped:
