@@ -17,6 +17,8 @@ from clbench.base.errors import InputError
 from clbench.base.text import counted, print_plain
 from clbench.cli.arguments import (
     MethodName,
+    PolicyName,
+    PolicySize,
     ScenarioId,
     Seed,
     Seeds,
@@ -29,8 +31,9 @@ from clbench.cli.arguments import (
 )
 from clbench.cli.runs import do_runs
 from clbench.jobs.folders import check_folders
-from clbench.records.paths import TUNING
+from clbench.records.paths import TUNING, table_name
 from clbench.spec.identifiers import without_module
+from clbench.spec.policies import DEFAULT_POLICY, SMALL, policy_name
 from clbench.spec.protocol import FIRST_TUNING_SEED
 from clbench.spec.references import BASELINE
 
@@ -52,6 +55,8 @@ def tune(
     targets: Annotated[int | None, whole_number(1)] = None,
     workers: Annotated[int | None, whole_number(1)] = None,
     device: str = "cpu",
+    policy: PolicyName = DEFAULT_POLICY,
+    policy_size: PolicySize = SMALL,
     records: Path = TUNING,
     write: Path | None = None,
 ) -> None:
@@ -79,6 +84,8 @@ def tune(
             records of such runs go to a separate folder, for example targets-1 below --records.
         workers: Number of runs at once, each a process with one thread (default: all cores).
         device: Device that runs the policies, for example cpu or cuda.
+        policy: flow, discrete_diffusion, or a class of your own as module:Class.
+        policy_size: small, base (5 million parameters) or large (40 million), for built-in policies.
         records: Folder of the records.
         write: File for the chosen settings; it keeps the settings of other methods. For built-in methods,
             `clbench run` reads methods/tuned/. Cannot be used with --values.
@@ -91,13 +98,17 @@ def tune(
     if targets is not None:  # a run of fewer targets must not replace the record of all
         records = records / f"targets-{targets}"
     numbers = range(first_seed, first_seed + seeds)
-    first = RunSpec(scenario, "", first_seed, device=device, split="validation", targets=targets)
 
     def run(wanted: Mapping[str, Sequence[Settings]]) -> dict[str, list[Tried]]:
         return _run(wanted, first, numbers, workers, records)
 
     add_cwd_to_path()
     with checked_input():
+        policy = policy_name(policy, policy_size)
+        first = RunSpec(
+            scenario, "", first_seed, device=device, split="validation", targets=targets, policy=policy
+        )
+        table = table_name(without_module(scenario), policy)
         names = chosen_methods(methods, every)
         if targets is not None and not values:
             raise InputError("--targets needs --values: settings are chosen on all targets.")
@@ -116,21 +127,19 @@ def tune(
         check_folders({"--records": records, "--write": write and write.parent})
         classes = {name: load_method(name) for name in names}
         if write is not None:
-            check_tuned(write, without_module(scenario), numbers, names)
+            check_tuned(write, table, numbers, names)
         ladder = {name: rungs(cls, fixed) for name, cls in classes.items()}
         combinations = _combinations(values or {})
     if values:
         found = run({BASELINE: [{}], **{name: _besides(name, combinations) for name in names}})
-        Console().print(_table(scenario, {name: (None, one) for name, one in found.items()}, seeds))
+        Console().print(_table(table, {name: (None, one) for name, one in found.items()}, seeds))
         return
     chosen = _choose(classes, ladder, run)
-    Console().print(
-        _table(scenario, {name: (one.settings, one.tried) for name, one in chosen.items()}, seeds)
-    )
+    Console().print(_table(table, {name: (one.settings, one.tried) for name, one in chosen.items()}, seeds))
     if write is not None:
         with checked_input():
-            write_tuned(write, without_module(scenario), numbers, chosen)
-        read = tuned_file(without_module(scenario))
+            write_tuned(write, table, numbers, chosen)
+        read = tuned_file(table)
         if write.resolve() != read.resolve():
             how = (
                 f"repeat this command with --write {read}, which keeps its other methods"
@@ -242,15 +251,15 @@ def _tried(runs: Sequence[ResolvedRun], records: Path) -> Tried:
     return Tried(dict(runs[0].changes), mean("final_average"), mean("adaptation"))
 
 
-def _table(scenario: str, found: Mapping[str, tuple[Settings | None, Sequence[Tried]]], seeds: int) -> Table:
+def _table(name: str, found: Mapping[str, tuple[Settings | None, Sequence[Tried]]], seeds: int) -> Table:
     """Return all settings with their scores, the chosen ones in bold.
 
     Args:
-        scenario: Gymnasium id of the scenario.
+        name: Name of the table that the runs belong to.
         found: For each method the settings that were chosen, None if none were, and all that were tried.
         seeds: Number of tuning seeds.
     """
-    table = Table(title=f"{scenario}, {counted(seeds, 'tuning seed')}, validation episodes")
+    table = Table(title=f"{name}, {counted(seeds, 'tuning seed')}, validation episodes")
     for title in ("method", "settings"):
         table.add_column(title, overflow="fold")
     for title in ("learned", "final average"):

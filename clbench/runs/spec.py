@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from clbench.base.errors import InputError, WrongTypeError
 from clbench.base.text import counted, did_you_mean
-from clbench.records.paths import label_of, record_path
+from clbench.records.paths import label_of, record_path, table_name
 from clbench.records.record import RunInfo, ScenarioInfo
 from clbench.runs.tuning import tuned_settings
 from clbench.spec.fields import check_whole
@@ -132,8 +132,13 @@ class ResolvedRun:
         from clbench.learning.registry import new_method
 
         is_tuning = self.spec.split == "validation"
-        tuned = {} if is_tuning else tuned_settings(self.scenario.id, self.spec.method)
+        tuned = {} if is_tuning else tuned_settings(self.table, self.spec.method)
         return new_method(self.spec.method, self.method, {**tuned, **self.changes})
+
+    @property
+    def table(self) -> str:
+        """Name of the table that it belongs to, see `table_name`."""
+        return table_name(self.scenario.id, self.spec.policy)
 
     @cached_property
     def protocol(self) -> Protocol:

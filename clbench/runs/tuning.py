@@ -26,6 +26,7 @@ from clbench.base.errors import InputError
 from clbench.base.lease import Lease
 from clbench.base.leftovers import replacing
 from clbench.base.strict_json import StrictJSONError, read_json
+from clbench.records.paths import table_parts
 from clbench.spec.identifiers import folder_name, scenario_ids
 
 if TYPE_CHECKING:
@@ -110,27 +111,31 @@ def rated_best(tried: Sequence[Tried]) -> list[Tried]:
     return [one for one in learners if one.final_average == best]
 
 
-def tuned_file(scenario: str) -> Path:
-    """Return the path of the file with the settings for the scenario with this id, which need not exist."""
+def tuned_file(table: str) -> Path:
+    """Return the path of the file with the settings for a table, which need not exist.
+
+    Args:
+        table: The id of a scenario, and the policy if it is another one; see `table_name`.
+    """
     methods = find_spec("clbench.methods")
     assert methods is not None
     assert methods.origin is not None
-    return Path(methods.origin).parent / "tuned" / f"{folder_name(scenario)}.json"
+    return Path(methods.origin).parent / "tuned" / f"{folder_name(table)}.json"
 
 
-def check_tuned(path: Path, scenario: str, seeds: Sequence[int], methods: Iterable[str]) -> None:
+def check_tuned(path: Path, table: str, seeds: Sequence[int], methods: Iterable[str]) -> None:
     """Refuse to write the settings of `methods`, tuned on `seeds`, to `path` beside others.
 
     Raises:
-        InputError: The others are of another scenario or were tuned on other seeds, or the file has no
-            settings.
+        InputError: The others are of another scenario or policy, or were tuned on other seeds, or the file
+            has no settings.
     """
     if not path.exists():
         return
     content = _settings_in(path)
-    if content["scenario"] != scenario:
+    if content["scenario"] != table:
         raise InputError(
-            f"{path} has the settings of {content['scenario']}, not of {scenario}: write to another file."
+            f"{path} has the settings of {content['scenario']}, not of {table}: write to another file."
         )
     if content["methods"].keys() - set(methods) and content["seeds"] != list(seeds):
         raise InputError(
@@ -156,7 +161,7 @@ def _settings_in(path: Path) -> dict[str, Any]:
     return content
 
 
-def write_tuned(path: Path, scenario: str, seeds: Sequence[int], methods: Mapping[str, Tuned]) -> None:
+def write_tuned(path: Path, table: str, seeds: Sequence[int], methods: Mapping[str, Tuned]) -> None:
     """Write the settings of `methods` to `path`, and keep those of others that it has already.
 
     Raises:
@@ -164,11 +169,11 @@ def write_tuned(path: Path, scenario: str, seeds: Sequence[int], methods: Mappin
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with Lease(path).held():  # another command may add a method at the same time
-        check_tuned(path, scenario, seeds, methods)
+        check_tuned(path, table, seeds, methods)
         known = {name: asdict(one) for name, one in methods.items()}
         if path.is_file():
             known = {**_settings_in(path)["methods"], **known}
-        content = {"scenario": scenario, "seeds": list(seeds), "methods": dict(sorted(known.items()))}
+        content = {"scenario": table, "seeds": list(seeds), "methods": dict(sorted(known.items()))}
         with replacing(path) as partial:  # a full disk leaves the settings of the others
             partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     tuned.cache_clear()
@@ -185,12 +190,12 @@ def _set_by_tuning(method: type[Method]) -> tuple[str, ...]:
 
 
 @cache
-def tuned(scenario: str) -> Mapping[str, Tuned]:
-    """Return what tuning chose on the scenario with this id, by method; nothing if it was never tuned.
+def tuned(table: str) -> Mapping[str, Tuned]:
+    """Return what tuning chose for a table, by method; nothing if it was never tuned.
 
     `CONTROLS` have what was chosen for their methods.
     """
-    path = tuned_file(scenario)
+    path = tuned_file(table)
     if not path.is_file():
         return {}
     methods = {
@@ -206,7 +211,10 @@ def tuned_scenarios() -> list[str]:
     return [name for name in scenario_ids() if tuned(name)]
 
 
-def tuned_settings(scenario: str, method: str) -> dict[str, Any]:
-    """Return the settings that tuning chose for a method; none if it was not tuned on the scenario."""
-    found = tuned(scenario).get(method)
+def tuned_settings(table: str, method: str) -> dict[str, Any]:
+    """Return the settings that tuning chose for a method; none if it was not tuned on the scenario.
+
+    On another policy, a method that was not tuned there has the settings for the usual one.
+    """
+    found = tuned(table).get(method) or tuned(table_parts(table)[0]).get(method)
     return dict(found.settings) if found else {}

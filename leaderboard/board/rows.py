@@ -166,8 +166,8 @@ def _row(
     )
 
 
-def _tried(scenario: str, method: str) -> int | None:
-    found = tuned(scenario).get(method)
+def _tried(table: str, method: str) -> int | None:
+    found = tuned(table).get(method)
     return len(found.tried) if found else None
 
 

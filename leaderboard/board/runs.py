@@ -170,7 +170,8 @@ def _check_settings(run: RunInfo) -> None:
         raise RecordError(f"run: changes and settings differ in {', '.join(lost)}.")
     if method not in built_in_methods():
         return
-    uses, defaults = _declared(run.scenario, method, run.split != "validation")
+    table = table_name(run.scenario, run.policy)
+    uses, defaults = _declared(table, method, run.split != "validation")
     if run.uses != uses:
         raise RecordError(f"run: uses do not match {method}: {', '.join(differences(run.uses, uses))}.")
     # a setting that is missing here was added later, with a default that changes nothing
@@ -184,10 +185,10 @@ def _check_settings(run: RunInfo) -> None:
 
 
 @cache
-def _declared(scenario: str, method: str, tuned: bool = True) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the prior data that a built-in method uses, and its settings, tuned for the scenario or not."""
+def _declared(table: str, method: str, tuned: bool = True) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the prior data that a built-in method uses, and its settings, tuned for the table or not."""
     cls = built_in_methods()[method].load()
-    settings = tuned_settings(scenario, method) if tuned else {}
+    settings = tuned_settings(table, method) if tuned else {}
     return dataclasses.asdict(cls.uses), {**dataclasses.asdict(cls()), **settings}
 
 
@@ -342,7 +343,7 @@ def same_settings(runs: list[Run]) -> Sifted:
     def parts(run: Run) -> list[dict[str, Any]]:
         info = run.record.run
         # a setting that an older record lacks was added later, with a default that changes nothing
-        defaults = _declared(info.scenario, info.method)[1] if info.method in built_in_methods() else {}
+        defaults = _declared(run.table, info.method)[1] if info.method in built_in_methods() else {}
         return [{**defaults, **info.settings}, info.uses, {"device": info.device, **_learner(run)}]
 
     def reason(run: Run, other: Run) -> str:

@@ -130,6 +130,24 @@ def test_a_run_takes_the_tuned_settings_unless_it_changes_them(toy_file: Path) -
     assert RunSpec(TOY, "ewc", 0).resolve().info.settings["step_factor"] == 1.0
 
 
+def test_settings_tuned_on_another_policy_are_its_own_and_the_other_methods_keep_the_usual_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tuning, "tuned_file", lambda table: tmp_path / f"{table.rpartition('/')[2]}.json")
+    tuned.cache_clear()
+    usual, other = (Tuned({"step_factor": factor}, (_tried(0.6, 0.9, factor),)) for factor in (0.3, 0.1))
+    for table, methods in (("", {"sft": usual, "lwf": usual}), ("+discrete_diffusion", {"sft": other})):
+        table = f"clbench/Toy-v0{table}"
+        write_tuned(tuning.tuned_file(table), table, [100, 101], methods)
+    factors = {
+        (method, policy): RunSpec(TOY, method, 0, policy=policy).resolve().info.settings["step_factor"]
+        for method in ("sft", "lwf")
+        for policy in ("flow", "discrete_diffusion")
+    }
+    tuned.cache_clear()
+    assert [*factors.values()] == [0.3, 0.1, 0.3, 0.3]
+
+
 def test_a_tuning_run_inherits_nothing_from_an_earlier_choice(toy_file: Path) -> None:
     settings = {"tau_start": 0.03, "schedule": 3.25, "step_factor": 0.1}
     write_tuned(toy_file, "clbench/Toy-v0", [100, 101], {"consft": Tuned(settings, (_tried(0.6, 0.9),))})
