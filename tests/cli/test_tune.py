@@ -100,7 +100,7 @@ def test_a_fixed_setting_is_in_every_run_and_in_the_file(tune: Tune, tmp_path: P
     assert [json.loads(path.read_text())["run"]["settings"]["schedule"] for path in records] == [2.0] * 6
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_method_is_tuned_on_another_policy_in_a_table_of_its_own(tune: Tune, tmp_path: Path) -> None:
     out, err = tune("--policy", "discrete_diffusion", "--write", "mine.json", method="sft")
     assert json.loads((tmp_path / "mine.json").read_text())["scenario"] == "me/Tiny-v0+discrete_diffusion"
