@@ -280,6 +280,8 @@ def _retrain(subject: Subject, progress: ProgressCallback) -> list[Check]:
 
 def _check_time(subject: Subject, again: Record) -> list[Check]:
     """Compare the time of a step relative to plain fine-tuning's, on which the relative cost rests."""
+    theirs: Any
+    ours: Any
     theirs, ours = (record.timing.get("step_ratio") for record in (subject.run.record, again))
     if not is_number(theirs) or not is_number(ours):
         return []
