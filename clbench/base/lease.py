@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
+import tempfile
 import time
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -13,12 +16,16 @@ from typing import NamedTuple
 from filelock import SoftFileLease, Timeout
 
 from clbench.base.errors import ClbenchError
+from clbench.base.progress import remark
 from clbench.base.strict_json import OPEN_PLAINLY, read_json
 from clbench.base.text import printable
 
 SECONDS = 30.0
 """Seconds without a heartbeat after which another machine may take a lease over. The end of a process is
 noticed at once on its own machine."""
+
+_REMOVAL = 1.5
+"""Times `SECONDS` after which a file that filelock leaves is removed: filelock comes first where it can."""
 
 REPORT_SECONDS = 5.0
 """Least time between two reports of progress, in seconds."""
@@ -32,10 +39,11 @@ class Owner(NamedTuple):
     """The process that holds a lease."""
 
     process: int
+    """Its number; 0 if its name has not reached this machine."""
     host: str
 
     def __str__(self) -> str:
-        return f"process {self.process} on {printable(self.host)}"
+        return f"process {self.process} on {printable(self.host)}" if self.process else "an unknown process"
 
 
 class Report(NamedTuple):
@@ -56,7 +64,8 @@ class Lease:
     """The right of one process to make a file or folder.
 
     A heartbeat keeps it. If the owner dies, another process takes it over: at once on the same machine, and
-    after `SECONDS` on another one that watches it meanwhile.
+    after `SECONDS` on another one that watches it meanwhile. Where filelock cannot do this, any process that
+    watches takes it over after 1.5 times `SECONDS`.
 
     Args:
         path: What is made. The file of the lease lies beside it.
@@ -65,12 +74,18 @@ class Lease:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._file = lease_path(path)
-        self._lock = SoftFileLease(self._file, lease_duration=SECONDS)
+        # the file is gone before it is closed: an error then says nothing of the lease
+        self._lock = SoftFileLease(self._file, lease_duration=SECONDS, close_error_policy="suppress")
         self._begin = self._reported = 0.0
+        self._seen: tuple[int, int, bytes] | None = None
+        self._since = 0.0
 
     def take(self) -> bool:
         """Take the lease, and return whether this process has it now; never wait."""
         self._file.parent.mkdir(parents=True, exist_ok=True)
+        return self._acquires() or (self._removes_dead() and self._acquires())
+
+    def _acquires(self) -> bool:
         try:
             self._lock.acquire(blocking=False)
         except Timeout:
@@ -78,12 +93,47 @@ class Lease:
         self._begin = time.monotonic()
         return True
 
+    def _removes_dead(self) -> bool:
+        """Remove the file of a dead owner, which filelock leaves in two cases, and return whether it is gone.
+
+        filelock exchanges two names in one step, which NFS and Lustre refuse. And it never removes an empty
+        file, which a machine leaves that stops before the content is on the disk. Here the file is renamed
+        and looked at again. If it is the lease of a new owner by then, it goes back. That owner may miss it
+        for a moment; then `check` stops its work, and no two owners write.
+        """
+        aside = self._file.with_name(f".{self._path.name}.{uuid.uuid4().hex}.lease")
+        try:
+            seen = _look(self._file)
+            if seen != self._seen:
+                self._seen, self._since = seen, time.monotonic()
+            if time.monotonic() - self._since < _REMOVAL * SECONDS:
+                return False
+            self._file.rename(aside)
+        except OSError:
+            return False
+        with contextlib.suppress(OSError):  # a third process may have the lease by now
+            if _look(aside) != seen:
+                os.link(aside, self._file)
+        with contextlib.suppress(OSError):
+            aside.unlink()
+        return True
+
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """Wait for the lease, and hold it inside."""
-        self._file.parent.mkdir(parents=True, exist_ok=True)
-        with self._lock.acquire(poll_interval=0.1):
+        """Wait for the lease, say for whom now and then, and hold it inside."""
+        begin, told = time.monotonic(), -SECONDS
+        while not self.take():
+            waited = time.monotonic() - begin
+            if waited - told >= SECONDS:
+                told = waited
+                remark(f"waiting for {self._holder() or 'another process'} to make {self._path}")
+            time.sleep(0.1 if waited < 1 else 1.0)  # a moment first, then seldom: a file server answers all
+        try:
+            if told >= 0:
+                remark("")
             yield
+        finally:
+            self.release()
 
     def check(self) -> None:
         """Refuse to go on without the lease.
@@ -98,8 +148,18 @@ class Lease:
 
     def _is_lost(self) -> bool:
         """Return whether another process has the lease; the heartbeat alone notices it up to 20 s late."""
+        if self._lock.compromise is not None:
+            return True
         found = self._lock.owner
-        return self._lock.compromise is not None or (found is not None and found.token != self._lock.token)
+        if found is not None:
+            return found.token != self._lock.token
+        try:
+            self._file.lstat()
+        except FileNotFoundError:  # whoever takes it over may be about to write its own
+            return True
+        except OSError:  # the heartbeat decides whether the folder fails for too long
+            return False
+        return False
 
     def release(self) -> None:
         """Give the lease back, if this process has it."""
@@ -125,14 +185,25 @@ class Lease:
 
     def clear(self) -> bool:
         """Remove the lease of a dead process, and its report; return whether nobody holds the lease."""
-        if self._lock.owner is None:  # no lease, or a file that someone else put there
-            if not self._file.exists():
-                self._remove_report()
+        if not self._file.exists():
+            self._remove_report()
             return True
-        if self.take():
+        if self._lock.owner is not None and self.take():
             self.release()
             return True
-        return False
+        return False  # it is held, has no content yet, or someone else put the file there
+
+    @property
+    def silence(self) -> float:
+        """Seconds since the last heartbeat of an owner, infinite without a lease.
+
+        The time is that of the file server, as far as it tells: the clock of this machine may be wrong.
+        """
+        try:
+            changed = self._file.stat().st_mtime
+        except OSError:
+            return math.inf
+        return now_in(self._file.parent) - changed
 
     @property
     def owner(self) -> Owner | None:
@@ -140,13 +211,19 @@ class Lease:
 
         A process of another machine counts for twice `SECONDS` after its last heartbeat.
         """
-        if self.clear():
+        return None if self.clear() else self._holder()
+
+    def _holder(self) -> Owner | None:
+        """Return the process that the file names, if it gave a sign of life."""
+        if self.silence >= 2 * SECONDS:
             return None
         found = self._lock.owner
+        if found is not None:
+            return Owner(found.pid, found.hostname)
         with contextlib.suppress(OSError):
-            if found is not None and time.time() - self._file.stat().st_mtime < 2 * SECONDS:
-                return Owner(found.pid, found.hostname)
-        return None
+            if self._file.stat().st_size == 0:  # the content has not reached this machine
+                return Owner(0, "")
+        return None  # a file that someone else put there
 
     @property
     def progress(self) -> Report | None:
@@ -160,3 +237,22 @@ class Lease:
 
 def _report_path(path: Path) -> Path:
     return path.with_name(f".{path.name}.progress")
+
+
+def _look(file: Path) -> tuple[int, int, bytes]:
+    """Return what a heartbeat or a new owner changes; NFS asks its server when a file is opened."""
+    descriptor = os.open(file, os.O_RDONLY | OPEN_PLAINLY)
+    try:
+        status = os.fstat(descriptor)
+        return status.st_ino, status.st_mtime_ns, os.read(descriptor, 4096)
+    finally:
+        os.close(descriptor)
+
+
+def now_in(folder: Path) -> float:
+    """Return the time of a folder's file server, or that of this machine where nothing can be written."""
+    try:
+        with tempfile.TemporaryFile(dir=folder, prefix=".") as file:
+            return os.fstat(file.fileno()).st_mtime
+    except OSError:
+        return time.time()

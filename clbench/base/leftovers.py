@@ -10,18 +10,17 @@ import os
 import re
 import shutil
 import socket
-import time
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
 
-from clbench.base.lease import Lease
+from clbench.base.lease import Lease, now_in
 
-FILE_SECONDS = 60.0
-"""Seconds after which an unfinished file of another machine counts as left behind: writing one takes less
-than a second. Folders have leases, which tell whether their maker lives."""
+LEFT_SECONDS = 600.0
+"""Seconds without a sign of life after which another machine counts as gone. Clocks of machines may differ:
+by less than 300 s, or neither Slurm's nor Kerberos' messages would be accepted."""
 
 _MAKER = r"(?P<host>[0-9a-f]{8})(?P<process>[0-9a-f]{8})[0-9a-f]{16}"
 _UNFINISHED = re.compile(rf"\.(?P<name>.+)\.{_MAKER}\.(?:partial|old)")
@@ -79,10 +78,16 @@ def is_left_behind(path: Path) -> bool:
         if made_here:
             return True
         with contextlib.suppress(OSError):
-            return time.time() - path.stat().st_mtime > FILE_SECONDS
+            return now_in(path.parent) - path.stat().st_mtime > LEFT_SECONDS
         return False
     # a maker takes the lease first: without an owner, what it made is finished or abandoned
-    return Lease(path.with_name(finished_name(path.name))).owner is None
+    return is_idle(path.with_name(finished_name(path.name)))
+
+
+def is_idle(path: Path) -> bool:
+    """Return whether no process can still be making the file or folder `path`."""
+    lease = Lease(path)
+    return lease.clear() or lease.silence > LEFT_SECONDS
 
 
 def sweep(*roots: Path) -> int:

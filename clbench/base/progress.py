@@ -14,12 +14,13 @@ def no_progress(amount: float) -> None:
 
 
 _listener: Callable[[str, str], None] | None = None
+_place = ""
 
 
 def listen(listener: Callable[[str, str], None] | None) -> None:
     """Let `listener` hear every place that the work of this process reaches, and remarks; None ends that."""
-    global _listener
-    _listener = listener
+    global _listener, _place
+    _listener, _place = listener, ""
 
 
 def announce(place: str, remark: str = "") -> None:
@@ -29,5 +30,12 @@ def announce(place: str, remark: str = "") -> None:
         place: The hook or the stage.
         remark: What to show beside it while it runs, such as the last success.
     """
+    global _place
+    _place = place
     if _listener is not None:
         _listener(place, remark)
+
+
+def remark(text: str) -> None:
+    """Show a text beside the place that the work has reached; an empty one removes it."""
+    announce(_place, text)

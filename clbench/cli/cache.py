@@ -23,8 +23,7 @@ from safetensors import SafetensorError, safe_open
 
 from clbench.base.cache import MANIFEST, cache_folder, hash_of
 from clbench.base.errors import InputError
-from clbench.base.lease import Lease
-from clbench.base.leftovers import finished_name, is_left_behind, is_unfinished, unfinished
+from clbench.base.leftovers import finished_name, is_idle, is_left_behind, is_unfinished, unfinished
 from clbench.base.text import counted, megabytes, print_plain
 from clbench.cli.arguments import checked_input, whole_number
 from clbench.jobs.folders import minari_folder
@@ -353,7 +352,7 @@ def find_stale(found: Iterable[Entry], days: int, now: float) -> dict[Entry, str
         if entry.is_leftover:
             if is_left_behind(entry.path):
                 stale[entry] = "left behind by a killed process"
-        elif Lease(entry.path).owner is not None:
+        elif not is_idle(entry.path):
             continue  # a run writes its checkpoints at the ends of stages only
         elif now - entry.used > days * _DAY:
             stale[entry] = f"not used for {_days(now - entry.used)}"

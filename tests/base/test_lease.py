@@ -6,13 +6,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from clbench.base import lease as leases
 from clbench.base.lease import Lease, LeaseLostError, lease_path
+from clbench.base.progress import announce, listen
 
 HOLD = """
 import sys, time
@@ -62,6 +63,106 @@ def test_the_lease_of_a_dead_process_is_taken_over_at_once(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.fixture
+def _like_nfs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the file system refuse to exchange two names, as NFS and Lustre do."""
+    monkeypatch.setattr(leases, "SECONDS", 0.2)
+    monkeypatch.setattr("filelock._soft.exchange_names", lambda *_: False, raising=False)
+
+
+def _from_elsewhere(path: Path) -> None:
+    """Leave the lease that a process of another machine took with its last heartbeat."""
+    lease = Lease(path)
+    assert lease.take()
+    text = lease_path(path).read_text()
+    lease.release()
+    host = next(line for line in text.splitlines() if line.startswith("host="))
+    lease_path(path).write_text(text.replace(host, "host=elsewhere"))
+
+
+@pytest.mark.usefixtures("_like_nfs")
+@pytest.mark.parametrize("leave", [_from_elsewhere, lambda path: lease_path(path).touch()])
+def test_a_lease_without_a_heartbeat_is_taken_over_where_names_cannot_be_exchanged(
+    tmp_path: Path, leave: Callable[[Path], None]
+) -> None:
+    leave(tmp_path / "x")
+    assert not Lease(tmp_path / "x").take()
+    begin = time.monotonic()
+    with Lease(tmp_path / "x").held():
+        assert leases.SECONDS < time.monotonic() - begin < 60
+        assert [path.name for path in tmp_path.iterdir()] == [".x.lease"]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("_like_nfs")
+def test_a_lease_with_a_heartbeat_stays_with_its_owner_where_names_cannot_be_exchanged(
+    tmp_path: Path,
+) -> None:
+    _from_elsewhere(tmp_path / "x")
+    lease, deadline = Lease(tmp_path / "x"), time.monotonic() + 4 * leases.SECONDS
+    while time.monotonic() < deadline:
+        os.utime(lease_path(tmp_path / "x"))
+        assert not lease.take()
+        time.sleep(0.05)
+
+
+@pytest.mark.usefixtures("_like_nfs")
+def test_a_new_owner_that_is_faster_keeps_its_lease(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _from_elsewhere(tmp_path / "x")
+    slow, fast = Lease(tmp_path / "x"), Lease(tmp_path / "x")
+
+    def rename(path: Path, target: Path) -> Path:
+        if path == lease_path(tmp_path / "x"):  # between the last look of the slow process and its rename
+            path.unlink()
+            assert fast.take()
+        return usual(path, target)
+
+    usual = Path.rename
+    assert not slow.take()
+    time.sleep(2 * leases.SECONDS)
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", rename)
+        assert not slow.take()
+    fast.check()
+    assert [path.name for path in tmp_path.iterdir()] == [".x.lease"]
+    fast.release()
+
+
+def test_a_lease_whose_content_has_not_arrived_has_an_unknown_owner(tmp_path: Path) -> None:
+    lease_path(tmp_path / "x").touch()
+    lease = Lease(tmp_path / "x")
+    assert not lease.clear()
+    assert str(lease.owner) == "an unknown process"
+    long_ago = time.time() - 3 * leases.SECONDS
+    os.utime(lease_path(tmp_path / "x"), (long_ago, long_ago))
+    assert lease.owner is None
+
+
+def test_a_wrong_clock_of_this_machine_ends_no_lease(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _from_elsewhere(tmp_path / "x")
+    monkeypatch.setattr(time, "time", lambda: 10.0**10)
+    assert str(Lease(tmp_path / "x").owner) == f"process {os.getpid()} on elsewhere"
+
+
+def test_a_process_that_waits_for_a_lease_says_for_whom(tmp_path: Path, other: subprocess.Popen[str]) -> None:
+    said: list[tuple[str, str]] = []
+    timer = threading.Timer(1.0, lambda: (other.kill(), other.wait()))
+    timer.start()
+    listen(lambda place, text: said.append((place, text)))
+    try:
+        announce("stage 1")
+        with Lease(tmp_path / "x").held():
+            pass
+    finally:
+        listen(None)
+    timer.join()
+    (first, waiting, last) = said
+    assert (first, last) == (("stage 1", ""), ("stage 1", ""))
+    assert waiting[0] == "stage 1"
+    assert waiting[1].startswith(f"waiting for process {other.pid} on ")
+    assert waiting[1].endswith(f" to make {tmp_path / 'x'}")
+
+
 def test_a_lease_that_is_waited_for_comes_when_its_owner_ends(
     tmp_path: Path, other: subprocess.Popen[str]
 ) -> None:
@@ -109,6 +210,15 @@ def test_an_owner_that_slept_learns_at_once_that_another_process_took_over(tmp_p
         other.kill()
 
 
+def test_an_owner_whose_lease_is_gone_learns_it_at_once(tmp_path: Path) -> None:
+    lease = Lease(tmp_path / "x")
+    assert lease.take()
+    lease_path(tmp_path / "x").unlink()
+    with pytest.raises(LeaseLostError, match=r"\.x\.lease was lost"):
+        lease.check()
+    lease.release()
+
+
 def _check_for_a_while(lease: Lease) -> None:
     deadline = time.monotonic() + 20
     while time.monotonic() < deadline:
@@ -123,12 +233,8 @@ def test_a_foreign_file_in_the_place_of_a_lease_is_left_alone(tmp_path: Path) ->
 
 
 def test_a_lease_whose_owner_is_on_another_machine_counts_while_it_is_fresh(tmp_path: Path) -> None:
+    _from_elsewhere(tmp_path / "x")
     lease = Lease(tmp_path / "x")
-    assert lease.take()
-    text = lease_path(tmp_path / "x").read_text()
-    lease.release()
-    host = next(line for line in text.splitlines() if line.startswith("host="))
-    lease_path(tmp_path / "x").write_text(text.replace(host, "host=elsewhere"))
     owner = lease.owner
     assert owner is not None
     assert str(owner) == f"process {os.getpid()} on elsewhere"

@@ -1,6 +1,7 @@
 """Leftovers of killed processes, of which some are still being made."""
 
 import os
+import re
 import subprocess
 import sys
 import time
@@ -9,14 +10,14 @@ from pathlib import Path
 import pytest
 
 from clbench.base.cache import cached
-from clbench.base.lease import Lease
-from clbench.base.leftovers import FILE_SECONDS, replacing, sweep, unfinished
+from clbench.base.lease import Lease, lease_path
+from clbench.base.leftovers import LEFT_SECONDS, replacing, sweep, unfinished
 
 HEX = "0123456789abcdef" * 2
 
 
 def _age(path: Path) -> None:
-    long_ago = time.time() - 2 * FILE_SECONDS
+    long_ago = path.stat().st_mtime - 2 * LEFT_SECONDS
     os.utime(path, (long_ago, long_ago))
 
 
@@ -60,6 +61,23 @@ def test_what_is_being_made_stays(tmp_path: Path) -> None:
     assert sweep(tmp_path) == 0
     assert len(list(tmp_path.iterdir())) == 4
     lease.release()
+
+
+def test_a_wrong_clock_removes_nothing_that_another_machine_is_making(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lease = Lease(tmp_path / "x")
+    assert lease.take()
+    text = lease_path(tmp_path / "x").read_text()
+    lease.release()
+    lease_path(tmp_path / "x").write_text(re.sub("host=.*", "host=elsewhere", text))
+    (tmp_path / f".x.{HEX}.partial").mkdir()
+    (tmp_path / f".seed-0.json.{HEX}.partial").write_text("{")
+    monkeypatch.setattr(time, "time", lambda: 10.0**10)
+    assert sweep(tmp_path) == 0
+    _age(lease_path(tmp_path / "x"))
+    _age(tmp_path / f".seed-0.json.{HEX}.partial")
+    assert sweep(tmp_path) == 2
 
 
 def test_a_folder_that_a_living_process_of_this_machine_makes_stays_without_its_lease(tmp_path: Path) -> None:
