@@ -90,9 +90,9 @@ class Bars:
         self._pieces[piece] = _Piece(bar, length, length, self._clock(), str(piece))
 
     def place(self, piece: Hashable, place: str) -> None:
-        """Show where a piece of work is, such as the stage of a run and its last success."""
+        """Show where a piece of work is, such as the stage of a run and its last success; "" is nowhere."""
         shown = self._pieces[piece]
-        shown.text = f"{piece}, {place}"
+        shown.text = f"{piece}, {place}" if place else str(piece)
         self._progress.update(shown.bar, description=escape(printable(shown.text)))
 
     def share(self, piece: Hashable) -> float:
@@ -107,6 +107,10 @@ class Bars:
         self._progress.advance(shown.bar, amount)
         self._progress.advance(self._all, amount)
         self._done += amount
+        self.tick()
+
+    def tick(self) -> None:
+        """Without a terminal, print now and then how far the work is, and what it is doing or waiting for."""
         now = self._clock()
         if self._progress.disable and now - self._last_line >= LINE_SECONDS:
             self._last_line = now

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable, Sequence
 
@@ -70,6 +71,8 @@ def run_jobs(jobs: Sequence[Job], workers: Workers, bars: Bars) -> dict[Job, str
                 else:
                     failed[job] = value
                 bars.finish(job, f"{value} ({time.monotonic() - started.pop(job):.0f} s)")
+            if started:
+                bars.tick()
     finally:
         try:
             workers.close()
@@ -95,17 +98,23 @@ class _Leases:
 
     def __init__(self, jobs: Sequence[Job]) -> None:
         self._all = {job: lease for job in jobs if (lease := job.new_lease()) is not None}
+        self._tried: dict[Job, float] = {}
         self._told = set[bool]()
 
     def take(self, ready: Iterable[Job], most: int) -> dict[Job, str | None]:
         """Take the leases of as many of the jobs as can be had, in their order, and return these jobs.
 
+        A lease that another command had within `WAIT_SECONDS` is not tried: a file server answers each try.
         Each comes with the fault of the file system that refused a lease, None where there is none.
         """
         taken: dict[Job, str | None] = {}
         for job in ready:
             if len(taken) >= most:  # a cluster that shrinks has fewer than none
                 break
+            now = time.monotonic()
+            if job in self._all and now - self._tried.get(job, -math.inf) < WAIT_SECONDS:
+                continue
+            self._tried[job] = now
             try:
                 if job not in self._all or self._all[job].take():
                     taken[job] = None

@@ -102,6 +102,22 @@ def test_a_bar_and_a_line_say_where_a_run_is() -> None:
         assert "sft seed 0, stage 2 (push) 17/20 after 32 steps" in text
 
 
+def test_work_that_only_waits_is_shown_without_a_terminal() -> None:
+    now = 0.0
+    file = io.StringIO()
+    with Bars(100, Console(file=file, width=140), clock=lambda: now) as bars:
+        bars.start("sft seed 0", 100)
+        bars.place("sft seed 0", "waiting for process 12 on node7")
+        for _ in range(30):
+            now += LINE_SECONDS / 10
+            bars.tick()
+        bars.place("sft seed 0", "")
+        now += LINE_SECONDS
+        bars.tick()
+    lines = file.getvalue().splitlines()
+    assert lines == [*["  0%: sft seed 0, waiting for process 12 on node7"] * 3, "  0%: sft seed 0"]
+
+
 def test_no_text_controls_the_terminal() -> None:
     file = io.StringIO()
     with Bars(1, Console(file=file, width=100, force_terminal=True)) as bars:

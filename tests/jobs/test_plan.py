@@ -11,11 +11,15 @@ from tiny import TINY
 
 from clbench.jobs.job import Job
 from clbench.jobs.plan import Plan
+from clbench.learning.pretraining import pretrained_policy
 from clbench.records.reader import read_record
 from clbench.records.writer import write_record
 from clbench.runs.length import run_length
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
+from clbench.runs.start import evaluate_pretrained
+
+TOY = "clbench.testing:clbench/Toy-v0"
 
 WATCHING = """
 import clbench
@@ -32,6 +36,13 @@ class Watching(clbench.Method):
 
 def _job(folder: Path, scenario: str, method: str) -> Job:
     return Plan().add_run(RunSpec(scenario, method, 0).resolve(), folder)
+
+
+def _plan(records: Path, *specs: RunSpec) -> list[Job]:
+    plan = Plan()
+    for spec in specs:
+        plan.add_run(spec.resolve(), records)
+    return plan.jobs
 
 
 def test_a_job_takes_no_function_of_its_command_to_another_machine(tmp_path: Path) -> None:
@@ -131,3 +142,52 @@ def test_runs_share_the_evaluation_of_a_start_only_if_it_is_the_same(
     assert starts({"perturb": True}, {"perturb": True}) == 1
     for other in ({"perturb": True}, {"split": "validation"}, {"order": 1}, {"targets": 1}):
         assert starts({}, other) == 2
+
+
+def test_runs_of_two_scenarios_have_separate_jobs_and_one_pretraining_for_each_seed(
+    tmp_path: Path, empty_caches: Path
+) -> None:
+    scenarios = ("clbench/Fetch-v1", TOY)
+    specs = [RunSpec(name, method, 1) for name in scenarios for method in ("sft", "frozen")]
+    names = [job.title for job in _plan(tmp_path, *specs)]
+    assert len(set(names)) == len(names)
+    assert [name for name in names if "pretraining" in name] == [
+        "Fetch-v1 pretraining seed 1",
+        "Toy-v0 pretraining seed 1",
+    ]
+
+
+@pytest.mark.long
+def test_a_run_waits_for_the_data_that_it_needs_and_no_other_data_is_made(
+    tmp_path: Path, empty_caches: Path
+) -> None:
+    def needs(*methods: str) -> dict[str, set[str]]:
+        jobs = _plan(tmp_path, *(RunSpec(TINY.id, method, 0) for method in methods))
+        return {job.title: {needed.title for needed in job.needs} for job in jobs}
+
+    skills = {f"me--Tiny-v0 demonstrations {task.name}" for task in TINY.retained}
+    targets = {f"me--Tiny-v0 demonstrations {task.name}" for task in TINY.target}
+    policy, questions, start, sft, joint = (
+        f"me--Tiny-v0 {name}"
+        for name in (
+            "pretraining seed 0",
+            "questions",
+            "evaluation of the pretrained policy seed 0",
+            "sft seed 0",
+            "joint seed 0",
+        )
+    )
+    found = needs("sft", "joint")
+    assert found[policy] == {questions} | skills
+    assert found[start] == {policy, questions}
+    assert found[sft] == {policy, questions, start} | targets
+    assert found[joint] == {policy, questions, start} | targets | skills
+    assert set(found) == {sft, joint} | found[joint]
+    pretrained_policy(TINY, 0)
+    assert needs("sft")[start] == {questions}
+    evaluate_pretrained(RunSpec(TINY.id, "joint", 0).resolve())
+    assert needs("sft") == {sft: {questions} | targets, questions: set(), **{name: set() for name in targets}}
+    demonstrated = {path.parent.name for path in (empty_caches / "minari").rglob("data")}
+    execute(RunSpec(TINY.id, "sft", 0), tmp_path)  # it never reads demonstrations of the skills: makes none
+    after = {path.parent.name for path in (empty_caches / "minari").rglob("data")}
+    assert after - demonstrated == {f"{task.name}-v0" for task in TINY.target}

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 import io
+import itertools
 import os
 import signal
 import subprocess
@@ -19,16 +20,14 @@ from rich.console import Console
 from tiny import TINY
 
 from clbench.base.errors import InputError
+from clbench.base.lease import Lease
 from clbench.jobs.bars import Bars
 from clbench.jobs.job import Event, Job, Product
 from clbench.jobs.plan import Plan
 from clbench.jobs.processes import Here, Processes
 from clbench.jobs.recorded import has_record
 from clbench.jobs.scheduler import run_jobs, run_with_bars
-from clbench.learning.pretraining import pretrained_policy
-from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
-from clbench.runs.start import evaluate_pretrained
 
 TOY = "clbench.testing:clbench/Toy-v0"
 
@@ -62,6 +61,11 @@ def leaves(progress):
 
 def reads(progress, name):
     return os.environ.get(name, "unset")
+
+def waits(progress):
+    from clbench.base.progress import remark
+    remark("waiting for process 12 to make x")
+    return "went well"
 
 def slow(progress, path):
     Path(path).write_text(str(os.getpid()))
@@ -303,6 +307,43 @@ def test_without_a_free_worker_the_scheduler_waits_for_one_and_says_so_once(
     assert [line.partition(":")[0] for line in rest] == ["one", "other"]
 
 
+def test_an_idle_worker_asks_for_the_job_of_another_command_once_a_second(
+    tmp_path: Path, bars: Bars, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual, asked = Lease.take, list[float]()
+
+    def take(lease: Lease) -> bool:
+        asked.append(time.monotonic())
+        return usual(lease)
+
+    class Busy(_Two):
+        """Workers of which one reports progress again and again."""
+
+        turns = 0
+
+        def events(self) -> Iterator[Event]:
+            self.turns += 1
+            if self.turns < 200:
+                yield Event(self._events[0].job, "progress", 0.0)
+            else:
+                owner.release()
+                yield from super().events()
+
+    owner = Lease(tmp_path / "x")
+    assert owner.take()
+    monkeypatch.setattr(Lease, "take", take)
+    busy = Job("busy", _function("good"), {}, 9.0)
+    assert run_jobs([busy, _claimed("claimed", tmp_path / "x")], Busy(), bars) == {}
+    assert len(asked) >= 2
+    assert all(later - earlier >= 1.0 for earlier, later in itertools.pairwise(asked))
+
+
+def test_a_job_that_waits_is_shown_without_a_terminal(bars: Bars, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("clbench.jobs.bars.LINE_SECONDS", 0.0)
+    assert run_jobs([_job("sft seed 0", "waits")], Processes(1), bars) == {}
+    assert "  0%: sft seed 0, waiting for process 12 to make x\n" in printed(bars)
+
+
 def test_progress_is_counted_in_the_expected_time_of_each_job(monkeypatch: pytest.MonkeyPatch) -> None:
     totals, advanced = [], []
 
@@ -322,55 +363,6 @@ def test_progress_is_counted_in_the_expected_time_of_each_job(monkeypatch: pytes
     assert run_with_bars(jobs, _Two(), Console(file=io.StringIO())) == {}
     assert totals == [30 + 70]
     assert advanced == [35, 35, 15, 15]
-
-
-def test_runs_of_two_scenarios_have_separate_jobs_and_one_pretraining_for_each_seed(
-    tmp_path: Path, empty_caches: Path
-) -> None:
-    scenarios = ("clbench/Fetch-v1", TOY)
-    specs = [RunSpec(name, method, 1) for name in scenarios for method in ("sft", "frozen")]
-    names = [job.title for job in _plan(tmp_path, *specs)]
-    assert len(set(names)) == len(names)
-    assert [name for name in names if "pretraining" in name] == [
-        "Fetch-v1 pretraining seed 1",
-        "Toy-v0 pretraining seed 1",
-    ]
-
-
-@pytest.mark.long
-def test_a_run_waits_for_the_data_that_it_needs_and_no_other_data_is_made(
-    tmp_path: Path, empty_caches: Path
-) -> None:
-    def needs(*methods: str) -> dict[str, set[str]]:
-        jobs = _plan(tmp_path, *(RunSpec(TINY.id, method, 0) for method in methods))
-        return {job.title: {needed.title for needed in job.needs} for job in jobs}
-
-    skills = {f"me--Tiny-v0 demonstrations {task.name}" for task in TINY.retained}
-    targets = {f"me--Tiny-v0 demonstrations {task.name}" for task in TINY.target}
-    policy, questions, start, sft, joint = (
-        f"me--Tiny-v0 {name}"
-        for name in (
-            "pretraining seed 0",
-            "questions",
-            "evaluation of the pretrained policy seed 0",
-            "sft seed 0",
-            "joint seed 0",
-        )
-    )
-    found = needs("sft", "joint")
-    assert found[policy] == {questions} | skills
-    assert found[start] == {policy, questions}
-    assert found[sft] == {policy, questions, start} | targets
-    assert found[joint] == {policy, questions, start} | targets | skills
-    assert set(found) == {sft, joint} | found[joint]
-    pretrained_policy(TINY, 0)
-    assert needs("sft")[start] == {questions}
-    evaluate_pretrained(RunSpec(TINY.id, "joint", 0).resolve())
-    assert needs("sft") == {sft: {questions} | targets, questions: set(), **{name: set() for name in targets}}
-    demonstrated = {path.parent.name for path in (empty_caches / "minari").rglob("data")}
-    execute(RunSpec(TINY.id, "sft", 0), tmp_path)  # it never reads demonstrations of the skills: makes none
-    after = {path.parent.name for path in (empty_caches / "minari").rglob("data")}
-    assert after - demonstrated == {f"{task.name}-v0" for task in TINY.target}
 
 
 @pytest.mark.long
