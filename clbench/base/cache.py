@@ -19,7 +19,8 @@ from safetensors import SafetensorError
 from clbench.base.errors import ClbenchError
 from clbench.base.lease import Lease
 from clbench.base.leftovers import finished_name, is_unfinished, unfinished
-from clbench.base.strict_json import read_json
+from clbench.base.source import files_below
+from clbench.base.strict_json import read_json, refusal
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -33,7 +34,15 @@ MANIFEST = "clbench.json"
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE)
 """Errors of a machine that has no room for a file, or none for an open one."""
 
-FAILING = (errno.EIO, errno.ESTALE, errno.EROFS, errno.ETIMEDOUT, errno.EHOSTDOWN)
+FAILING = (
+    errno.EIO,
+    errno.ESTALE,
+    errno.EROFS,
+    errno.ESHUTDOWN,
+    errno.ETIMEDOUT,
+    errno.EHOSTDOWN,
+    errno.EHOSTUNREACH,
+)
 """Errors of a disk, or of the network to a shared folder."""
 
 
@@ -149,7 +158,7 @@ def is_cached(folder: Path, inputs: Mapping[str, Any]) -> bool:
     """Return whether `folder` is whole and was made from `inputs`.
 
     Raises:
-        CacheError: The machine fails while it reads.
+        CacheError: The file system refuses to read.
     """
     return fault_of(folder, inputs) is None
 
@@ -158,7 +167,7 @@ def fault_of(folder: Path, inputs: Mapping[str, Any]) -> str | None:
     """Return why `folder` cannot serve as the result of `inputs`, as the end of a sentence, or None.
 
     Raises:
-        CacheError: The machine fails while it reads.
+        CacheError: The file system refuses to read.
     """
     return _fault(folder, hash_of(inputs))
 
@@ -167,7 +176,7 @@ def _fault(folder: Path, key: str) -> str | None:
     """Return the fault of `folder`, or None.
 
     Raises:
-        CacheError: The machine fails while it reads: what is there may be whole, and stays.
+        CacheError: The file system refuses to read: what is there may be whole, and stays.
     """
     try:
         manifest = read_json(folder / MANIFEST)
@@ -176,15 +185,15 @@ def _fault(folder: Path, key: str) -> str | None:
         if manifest["files"] != _file_hashes(folder):
             return "is torn: its files are not those that were written"
     except (OSError, ValueError, KeyError, TypeError) as error:
-        refused = error if isinstance(error, OSError) else error.__cause__  # of `read_json`
-        if isinstance(refused, OSError) and is_the_machines(refused):
+        refused = refusal(error)
+        if refused is not None:
             raise CacheError(f"{folder} cannot be read now: {refused.strerror}.") from error
         return "is torn or foreign: it has no readable manifest"
     return None
 
 
 def _file_hashes(folder: Path) -> dict[str, str]:
-    paths = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != MANIFEST)
+    paths = [path for path in files_below(folder) if path.name != MANIFEST]
     return {path.relative_to(folder).as_posix(): _file_hash(path) for path in paths}
 
 

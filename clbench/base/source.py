@@ -10,10 +10,13 @@ Comments, docstrings and blank lines of Python files do not count: a better sent
 from __future__ import annotations
 
 import ast
+import errno
 import functools
 import hashlib
 import importlib.util
+import os
 import re
+import stat
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -53,12 +56,35 @@ def source_hash(*modules: str) -> str:
         files = [origin]
         if origin.name == "__init__.py":
             # Python and numba keep what they compile there, and would change the key in the middle of a run
-            below = sorted(origin.parent.rglob("*"))
+            below = files_below(origin.parent)
             files = [one for one in below if one.parent.name != "__pycache__" and one.name[0] != "."]
         for path in [*files, *_imported_beside(module, origin, files)]:
             if path.is_file():
                 digest.update(_file_hash(path, *_stamp(path)))
     return digest.hexdigest()[:16]
+
+
+def files_below(folder: Path) -> list[Path]:
+    """Return the regular files below a folder, in order.
+
+    Raises:
+        OSError: The file system refuses. `Path.rglob` leaves out what it cannot list, since Python 3.12.
+    """
+
+    def refuse(error: OSError) -> None:
+        raise error
+
+    found = (Path(place, name) for place, _, names in os.walk(folder, onerror=refuse) for name in names)
+    return sorted(filter(_is_regular, found))
+
+
+def _is_regular(path: Path) -> bool:
+    try:
+        return stat.S_ISREG(path.stat().st_mode)
+    except OSError as error:
+        if error.errno in (errno.ENOENT, errno.ENOTDIR, errno.ELOOP):  # a link that leads nowhere
+            return False
+        raise
 
 
 def _stamp(path: Path) -> tuple[int, int]:

@@ -38,6 +38,17 @@ class StrictJSONError(ClbenchError, ValueError):
     """A file is not JSON, or exceeds a limit."""
 
 
+def refusal(error: Exception) -> OSError | None:
+    """Return the error of a file system that cannot read now what may be sound, None for any other error.
+
+    Args:
+        error: Such an error, or one that it caused, as `read_json` raises it.
+    """
+    found = error if isinstance(error, OSError) else error.__cause__
+    nothing = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
+    return found if isinstance(found, OSError) and not isinstance(found, nothing) else None
+
+
 def read_json(path: Path) -> Any:
     """Return the JSON in the regular file at `path`.
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Iterator
 from itertools import takewhile
 from traceback import walk_tb
-from types import FunctionType
+from types import FrameType, FunctionType
 
 from clbench.base.source import names_in
 from clbench.base.text import did_you_mean
@@ -68,12 +69,24 @@ def place_of(error: BaseException, place: str) -> str:
         error: The error, with its traceback and those of the errors that caused it.
         place: What ran: a stage, or a hook.
     """
+    for frame in _frames_of_method(error):
+        hook = frame.f_code.co_name
+        if hook in HOOKS:
+            called = place.partition(" ")[0].removesuffix("()") == hook
+            return place if called else f"{hook}() of {place}"
+    return place
+
+
+def comes_from_method(error: BaseException) -> bool:
+    """Return whether a function of a method ran when an error, or one that caused it, was raised."""
+    return next(_frames_of_method(error), None) is not None
+
+
+def _frames_of_method(error: BaseException) -> Iterator[FrameType]:
+    """Yield the frames of methods in which an error, and then each that caused it, was raised."""
     cause: BaseException | None = error
     while cause is not None:
         for frame, _ in walk_tb(cause.__traceback__):
-            hook = frame.f_code.co_name
-            if hook in HOOKS and isinstance(frame.f_locals.get("self"), Method):
-                called = place.partition(" ")[0].removesuffix("()") == hook
-                return place if called else f"{hook}() of {place}"
+            if isinstance(frame.f_locals.get("self"), Method):
+                yield frame
         cause = cause.__cause__
-    return place

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from clbench.base.errors import ClbenchError, InputError
-from clbench.base.strict_json import StrictJSONError, read_json
+from clbench.base.strict_json import StrictJSONError, read_json, refusal
 from clbench.base.text import quoted
 from clbench.records.content import content_hash
 from clbench.records.fields import load_fields
@@ -68,10 +68,7 @@ def read_record(path: Path | str) -> Record:
 
 def _may_be_sound(error: Exception) -> bool:
     """Return whether an error in reading says nothing against the record itself."""
-    refused, nothing = error.__cause__, (FileNotFoundError, NotADirectoryError, IsADirectoryError)
-    return isinstance(error, UnreadableRecordError) or (
-        isinstance(refused, OSError) and not isinstance(refused, nothing)
-    )
+    return isinstance(error, UnreadableRecordError) or refusal(error) is not None
 
 
 def home_of(run: RunInfo) -> Path:

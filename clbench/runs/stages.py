@@ -16,13 +16,15 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import torch
+
 from clbench.base.cache import NO_ROOM, CacheError, cache_folder, cached, hash_of, is_cached, is_the_machines
 from clbench.base.errors import ClbenchError
 from clbench.base.lease import LeaseLostError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.evaluation.checks import Checker
 from clbench.learning.adaptation import Step
-from clbench.learning.hooks import place_of
+from clbench.learning.hooks import comes_from_method, place_of
 from clbench.learning.optimise import MethodError, deterministic
 from clbench.learning.registry import describe_method
 from clbench.learning.trainer import STAGE_FILES, Trainer, load_stage, training_inputs
@@ -44,11 +46,15 @@ LENGTH = "steps.txt"
 
 
 class MachineError(ClbenchError, OSError):
-    """While a method ran, the machine had no room for a file, or its disk or network failed."""
+    """While a method ran, the machine had no room for a file, or its disk, network or GPU failed."""
 
 
 NOT_THE_METHOD = (CacheError, CheckpointError, LeaseLostError, MachineError, RenderingError)
 """Failures of the machine: a run can be done again, and leaves no record that blames its method."""
+
+
+_ASSERTION = 710
+"""CUDA's number for an assertion on the GPU, such as an index out of range: the code that ran is wrong."""
 
 
 @contextmanager
@@ -56,19 +62,30 @@ def machine_needed() -> Iterator[None]:
     """Tell a failure of the machine apart from what a method inside does wrong.
 
     Raises:
-        MachineError: The machine has no room, or its disk or network fails.
+        MachineError: The machine has no room; its disk, network or GPU fails; or the file system refuses
+            something to clbench, and not to a function of a method.
     """
     try:
         yield
+    except ClbenchError:  # it says what is to blame
+        raise
     except OSError as error:
-        if not is_the_machines(error):
+        if comes_from_method(error) and not is_the_machines(error):
             raise
-        full = error.errno in NO_ROOM
-        fault, mend = ("has no room", "make room") if full else ("failed", "mend it")
-        raise MachineError(
-            f"The machine {fault}: {error}. The method is not to blame, and the run leaves no record: "
-            f"{mend}, and repeat the command."
-        ) from error
+        raise _machine_error(error, error.errno in NO_ROOM) from error
+    except torch.AcceleratorError as error:
+        if getattr(error, "error_code", None) == _ASSERTION:
+            raise
+        raise _machine_error(error) from error
+
+
+def _machine_error(error: Exception, is_full: bool = False) -> MachineError:
+    fault, mend = ("has no room", "make room") if is_full else ("failed", "mend it")
+    reason = str(error).partition("\n")[0]
+    return MachineError(
+        f"The machine {fault}: {reason}. The method is not to blame, and the run leaves no record: "
+        f"{mend}, and repeat the command."
+    )
 
 
 @contextmanager

@@ -59,28 +59,31 @@ def test_a_torn_or_foreign_folder_is_logged_and_made_again(
     assert [path.name for path in tmp_path.iterdir()] == ["x"]
 
 
-@pytest.mark.parametrize("name", ["clbench.json", "value.txt"])
+@pytest.mark.parametrize(
+    "number", [errno.ESTALE, errno.EACCES, errno.ESHUTDOWN, errno.ENOTCONN, errno.ENOMEM]
+)
+@pytest.mark.parametrize("name", ["clbench.json", "value.txt", "x"])
 def test_a_result_that_cannot_be_read_now_is_kept(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[str] = []
     _value(tmp_path / "x", INPUTS, "first", calls)
-    for module, function in ((os, "open"), (io, "open")):
-        monkeypatch.setattr(module, function, _stale(getattr(module, function), name))
-    with pytest.raises(CacheError, match="x cannot be read now: Stale file handle"):
+    for module, function in ((os, "open"), (io, "open"), (os, "scandir")):  # files, and the folder x
+        monkeypatch.setattr(module, function, _refusing(getattr(module, function), name, number))
+    with pytest.raises(CacheError, match=f"x cannot be read now: {os.strerror(number)}"):
         _value(tmp_path / "x", INPUTS, "second", calls)
-    with pytest.raises(CacheError, match="x cannot be read now: Stale file handle"):
+    with pytest.raises(CacheError, match=f"x cannot be read now: {os.strerror(number)}"):
         is_cached(tmp_path / "x", INPUTS)
     monkeypatch.undo()
     assert _value(tmp_path / "x", INPUTS, "third", calls) == "first"
 
 
-def _stale(usual: Callable[..., Any], name: str) -> Callable[..., Any]:
-    """Return a function that opens files as on a shared folder that lost the one called `name`."""
+def _refusing(usual: Callable[..., Any], name: str, number: int) -> Callable[..., Any]:
+    """Return a function that opens as on a shared folder that does not answer for what is called `name`."""
 
     def opened(path: Any, *arguments: Any, **options: Any) -> Any:
         if Path(str(path)).name == name:
-            raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), str(path))
+            raise OSError(number, os.strerror(number), str(path))
         return usual(path, *arguments, **options)
 
     return opened

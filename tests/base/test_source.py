@@ -1,5 +1,6 @@
 """Hashes of source code: a cache key covers all code of its stage, and every module it names exists."""
 
+import errno
 import importlib
 import os
 import subprocess
@@ -14,6 +15,7 @@ from clbench.base.source import (
     RUN_SOURCES,
     TRAINING_SOURCES,
     class_hash,
+    files_below,
     source_hash,
 )
 
@@ -99,6 +101,25 @@ def test_a_change_of_a_file_below_a_package_changes_its_hash(
     assert source_hash("some_package") == before
     (deep / "words.txt").write_text("three")
     assert source_hash("some_package") != before
+
+
+def test_a_folder_of_code_that_cannot_be_listed_is_not_taken_for_an_empty_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "below").mkdir()
+    (tmp_path / "below" / "code.py").touch()
+    (tmp_path / ".#code.py").symlink_to("nowhere")  # an editor's
+    assert files_below(tmp_path) == [tmp_path / "below" / "code.py"]
+
+    def refuse(path: str) -> Iterator[os.DirEntry[str]]:
+        if Path(path).name == "below":
+            raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), path)
+        return usual(path)
+
+    usual = os.scandir
+    monkeypatch.setattr(os, "scandir", refuse)
+    with pytest.raises(OSError, match="Stale file handle"):
+        files_below(tmp_path)
 
 
 def test_what_python_numba_and_editors_keep_beside_code_does_not_change_a_hash(

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
+import torch
 from tiny import TINY
 
 from clbench.base import lease as leases
@@ -179,11 +180,51 @@ class _Reads(_Writes):
     _fault: ClassVar[tuple[int, str]] = errno.ESTALE, "data.pt"
 
 
+@dataclasses.dataclass
+class _Computes(Method):
+    """A method whose GPU fails."""
+
+    _code: ClassVar[int] = 214
+
+    def end_task(self, policy: Policy, stage: Any) -> None:
+        error = torch.AcceleratorError("CUDA error: uncorrectable ECC error\nCompile with TORCH_USE_CUDA_DSA")
+        error.error_code = self._code
+        raise error
+
+
+@dataclasses.dataclass
+class _Asserts(_Computes):
+    """A method whose index is out of range on a GPU."""
+
+    _code: ClassVar[int] = 710
+
+
+def test_an_assertion_on_the_gpu_is_a_failure_of_the_method(
+    tmp_path: Path, stranger: Callable[[type[Method]], str]
+) -> None:
+    record = execute(RunSpec(TINY.id, stranger(_Asserts), seed=0), tmp_path)
+    assert record.error is not None
+    assert record.error["where"] == "end_task() of stage 1 (right)"
+
+
+def test_what_the_file_system_refuses_to_clbench_is_no_failure_of_the_method(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), "/home/colleague/stage-0")
+
+    monkeypatch.setattr("clbench.runs.run.drop_stages", refuse)
+    with pytest.raises(MachineError, match=r"denied: '/home/colleague/stage-0'\. The method is not"):
+        execute(RunSpec(TINY.id, "sft", seed=0), tmp_path / "records", checkpoints=tmp_path / "kept")
+    assert not (tmp_path / "records").exists()
+
+
 @pytest.mark.parametrize(
     ("cls", "fault"),
     [
         (_Writes, "The machine has no room: .*No space left on device: 'notes.txt'"),
         (_Reads, "The machine failed: .*'data.pt'"),
+        (_Computes, "The machine failed: CUDA error: uncorrectable ECC error"),
     ],
 )
 def test_a_full_disk_or_a_failing_network_is_not_the_methods_fault_and_leaves_no_record(
