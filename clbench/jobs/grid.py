@@ -103,7 +103,9 @@ def run_missing(
         InputError: A record is of another definition of its scenario, or this machine cannot render what a
             scenario needs.
     """
-    sweep(records, cache_folder(), minari_folder() / "clbench")
+    from clbench.jobs.work import do_run, make_policies
+
+    sweep(records, cache_folder(), minari_folder() / "clbench", *([checkpoints] if checkpoints else []))
     to_do = missing(runs, records, checkpoints)
     there = len(runs) - len(to_do.runs)
     if there:
@@ -123,26 +125,28 @@ def run_missing(
     if check in failed:
         return failed
     seconds = time.monotonic() - begin
-    lost = _without_record(plan.jobs, failed, records)
+    run_jobs = [job for job in plan.jobs if job.function is do_run]
+    lost = _without_record(run_jobs, failed, records)
     for job, reason in lost.items():
         _print(console, f"{job}: {reason}")
     failed |= lost
-    lost_runs = sum(job.product is not None for job in failed)
+    lost_runs = sum(job in failed for job in run_jobs)
     done = f"{_part(lost_runs, len(to_do.runs))}{counted(len(to_do.runs), 'run')}"
     if to_do.stages:
-        from clbench.jobs.work import make_policies
-
         lost_stages = sum(job.function is make_policies for job in failed)
         done += f" and the policies of {_part(lost_stages, len(to_do.stages))}{len(to_do.stages)}"
     _print(console, f"{done} in {seconds / 60:.1f} minutes; records in {records}.")
-    others = len(missing(to_do.runs, records, checkpoints).stages)
-    if others:
-        _print(
-            console,
-            f"Another command did {counted(others, 'run')} and kept no policies in {checkpoints}. Repeat the "
-            "command to make them again, and keep them.",
-        )
+    bare = missing(to_do.runs, records, checkpoints).stages
+    if bare:
+        kept = f"and kept no policies in {checkpoints}. Repeat the command to make them again, and keep them."
+        _print(console, f"Another command did {counted(len(bare), 'run')} {kept}")
+        theirs = {run.path(records.absolute()) for run in bare}
+        failed |= {job: f"another command did it {kept}" for job in run_jobs if _path(job) in theirs}
     return failed
+
+
+def _path(job: Job) -> Path | None:
+    return None if job.product is None else job.product.path
 
 
 def _part(lost: int, count: int) -> str:

@@ -19,14 +19,14 @@ class JobError(ClbenchError):
 
 @dataclass(frozen=True, eq=False)
 class Product:
-    """A file that a job makes. One command at a time makes it; others wait, and do other jobs meanwhile."""
+    """What a job makes. One command at a time makes it; others wait, and do other jobs meanwhile."""
 
     path: Path
-    """Place of the file."""
+    """Place of the file or folder."""
     exists: Callable[[], bool]
-    """Returns whether a command has made the file."""
+    """Returns whether a command has made it."""
     has_failed: Callable[[], bool] = bool
-    """Returns whether another command tried to make the file since this one began, and failed."""
+    """Returns whether another command tried to make it since this one began, and failed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class Job:
     pace: float = 1.0
     """Expected time of a unit of length, relative to an optimiser step."""
     product: Product | None = None
-    """File that the job makes. If None, several commands may do the job at once."""
+    """What the job makes. If None, several commands may do the job at once."""
 
     def __str__(self) -> str:
         return self.title

@@ -97,7 +97,7 @@ class Plan:
             run_length(run.scenario, run.protocol) + watching_length(run.method, run.scenario),
             (*self._needs(run), *((start,) if start else ())),
             limits,
-            records,
+            _record_of(run, records),
         )
 
     def add_stages(self, run: ResolvedRun, checkpoints: Path | None) -> Job:
@@ -110,7 +110,8 @@ class Plan:
         arguments = {"spec": run.spec, "checkpoints": checkpoints and checkpoints.absolute()}
         title = f"stages of {_label(run)}"
         length = training_length(run.scenario) + watching_length(run.method, run.scenario)
-        return self._add(run, title, work.make_policies, arguments, length, self._needs(run))
+        product = None if checkpoints is None else _policies_of(run, checkpoints.absolute())
+        return self._add(run, title, work.make_policies, arguments, length, self._needs(run), product=product)
 
     def add_demonstrations(self, name: str, scenario: Scenario, tasks: Iterable[Task]) -> tuple[Job, ...]:
         """Add jobs that collect the demonstrations of tasks, and return them.
@@ -131,10 +132,9 @@ class Plan:
         length: float,
         needs: tuple[Job, ...],
         limits: Limits | None = None,
-        records: Path | None = None,
+        product: Product | None = None,
     ) -> Job:
         title = _title(run.spec.scenario, title, run.spec.policy)
-        product = None if records is None else _record_of(run, records)
         job = Job(title, function, {**arguments}, length, needs, limits, run.spec.device, _pace(run), product)
         self._runs.append(job)
         return job
@@ -221,6 +221,13 @@ def _record_of(run: ResolvedRun, records: Path) -> Product:
         exists=lambda: has_record(run, records),
         has_failed=lambda: _version(path) != before and has_failed(run, records),
     )
+
+
+def _policies_of(run: ResolvedRun, checkpoints: Path) -> Product:
+    """Return the folder with the policies of all stages of a run."""
+    from clbench.runs.stages import has_stages  # imports PyTorch
+
+    return Product(run.path(checkpoints).with_suffix(""), exists=lambda: has_stages(run, checkpoints))
 
 
 def _version(path: Path) -> tuple[int, int] | None:

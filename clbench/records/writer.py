@@ -67,7 +67,8 @@ def write_result(record: Record, path: Path) -> None:
         return
     if is_kept and is_other:
         aside = free_name(path, "old")
-        shutil.copyfile(path, aside)  # and not renamed: a reader finds a record there at any time
+        with replacing(aside) as partial:  # and not renamed: a reader finds a record there at any time
+            shutil.copyfile(path, partial)
         LOG.warning("%s was of other settings, another budget or device: it is now %s.", path, aside.name)
     write_record(record, path)
 

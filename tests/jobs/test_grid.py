@@ -16,12 +16,13 @@ from rich.console import Console
 import clbench
 from clbench.base.errors import ClbenchError
 from clbench.base.progress import ProgressCallback
-from clbench.jobs.grid import run_missing
+from clbench.jobs.grid import missing, run_missing
 from clbench.jobs.job import Job
 from clbench.jobs.processes import Here
+from clbench.jobs.scheduler import run_with_bars
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
-from clbench.runs.stages import has_stages
+from clbench.runs.stages import has_stages, keep_stages
 
 TOY = "clbench.testing:clbench/Toy-v0"
 TINY = "tiny:me/Tiny-v0"
@@ -163,13 +164,30 @@ def test_a_run_of_another_command_that_kept_no_policies_is_told(
 
     monkeypatch.setattr("clbench.jobs.grid.run_with_bars", elsewhere)
     printed = io.StringIO()
-    run_missing([spec.resolve()], records, Here, Console(file=printed, width=200), tmp_path / "kept")
+    console = Console(file=printed, width=200)
+    failed = run_missing([spec.resolve()], records, Here, console, tmp_path / "kept")
     assert f"Another command did 1 run and kept no policies in {tmp_path / 'kept'}." in printed.getvalue()
+    ((job, reason),) = failed.items()
+    assert str(job) == "me--Tiny-v0 frozen seed 0"
+    assert reason.startswith("another command did it and kept no policies in ")
     monkeypatch.undo()
     printed = io.StringIO()
     run_missing([spec.resolve()], records, Here, Console(file=printed, width=200), tmp_path / "kept")
     assert has_stages(spec.resolve(), tmp_path / "kept")
     assert "Another command" not in printed.getvalue()
+
+
+@pytest.mark.long
+def test_policies_that_another_command_has_made_again_meanwhile_are_not_made_twice(tmp_path: Path) -> None:
+    run, records, kept = RunSpec(TINY, "frozen", 0).resolve(), tmp_path / "records", tmp_path / "kept"
+    execute(run, records)
+    jobs = missing([run], records, kept).plan(records, kept).jobs
+    keep_stages(run, kept)  # the other command began at the same time, and was faster
+    before = {path: path.stat().st_ino for path in kept.rglob("*")}
+    printed = io.StringIO()
+    assert run_with_bars(jobs, Here(), Console(file=printed, width=200)) == {}
+    assert "me--Tiny-v0 stages of frozen seed 0: done by another command" in printed.getvalue()
+    assert {path: path.stat().st_ino for path in kept.rglob("*")} == before
 
 
 @pytest.mark.parametrize(

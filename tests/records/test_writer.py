@@ -1,6 +1,7 @@
 """The writer of records: everything that it writes can be read, and comes back equal."""
 
 import dataclasses
+import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +14,7 @@ from clbench.base.strict_json import LONGEST_TEXT
 from clbench.records.paths import record_path
 from clbench.records.reader import RecordError, read_record
 from clbench.records.record import Record
-from clbench.records.writer import MOST_DIAGNOSTICS, check_diagnostics, write_record
+from clbench.records.writer import MOST_DIAGNOSTICS, check_diagnostics, write_record, write_result
 
 
 def test_a_record_that_was_written_is_read_as_it_was(record: Record, tmp_path: Path) -> None:
@@ -64,6 +65,23 @@ def test_a_record_that_cannot_be_written_leaves_the_old_one_and_no_partial(
         write_record(record, path)
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["record.json"]
+
+
+def test_a_full_disk_leaves_no_torn_copy_of_a_record_of_other_settings(
+    record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fill(source: Path, target: Path) -> None:
+        Path(target).write_text("{")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(target))
+
+    path = tmp_path / "seed-0.json"
+    write_record(record, path)
+    before = path.read_bytes()
+    monkeypatch.setattr("shutil.copyfile", fill)
+    on_a_gpu = dataclasses.replace(record, run=dataclasses.replace(record.run, device="cuda"))
+    with pytest.raises(OSError, match="No space left on device"):
+        write_result(on_a_gpu, path)
+    assert (list(tmp_path.iterdir()), path.read_bytes()) == ([path], before)
 
 
 def test_diagnostics_with_tuples_and_numbers_as_names_can_be_read(record: Record, tmp_path: Path) -> None:
