@@ -170,6 +170,6 @@ def _stages_folders(runs: Sequence[ResolvedRun], checkpoints: Path | None, conso
     for run, folder in zip(runs, found, strict=True):
         if folder is None:
             plan.add_stages(run, None)
-    if plan.jobs and run_with_bars(plan.jobs, Processes(), console):
+    if plan.jobs and run_with_bars(plan.jobs, Processes(device=runs[0].spec.device), console):
         sys.exit(1)
     return [folder or make_stages(run) for run, folder in zip(runs, found, strict=True)]

@@ -6,6 +6,7 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -85,12 +86,13 @@ def run(
         perturb: Also evaluate the skills and each new target in perturbed worlds: other start poses, heavier
             or lighter objects and, in pictures, another camera and light. Such a record replaces a record
             without perturbed episodes, as it holds the same episodes and more.
-        workers: Number of runs at once, each a process with one thread (default: all cores).
+        workers: Number of runs at once, each a process with one thread (default: all cores; with --device
+            cuda, all GPUs).
         shard: Do only part i of n of the runs, for example 2/8: for array jobs with one folder of records.
         ray: Do the runs on a Ray cluster: its address, auto for a cluster on this machine, or local to start
             one.
         records: Folder of the records.
-        device: Device that runs the policies, for example cpu or cuda.
+        device: Device that runs the policies, for example cpu or cuda, which gives each run one of the GPUs.
         changes: Hyper-parameters to change, as --set.name value. All others keep the values tuned for the
             scenario or, without tuning, the method's defaults. Such a run gets a separate record, which the
             leaderboard does not show.
@@ -103,6 +105,7 @@ def run(
     with checked_input():
         ids = items_of("SCENARIOS", scenarios)
     check_names(ids, methods)
+    from clbench.jobs.processes import at_once
     from clbench.runs.spec import RunSpec, check_device
     from clbench.runs.tensorboard import require_tensorboard
     from clbench.scoring.expected_precision import expected_precision
@@ -126,9 +129,10 @@ def run(
         console.print(expected_precision(scenario, seeds), highlight=False)
     if dry_run:
         # nothing asks a cluster for its cores before there is work for it
-        _print_forecast(chosen, records, workers or (1 if ray else None), checkpoints)
+        _print_forecast(chosen, records, workers or (1 if ray else at_once(device)), checkpoints)
         return
-    went_well = do_runs(chosen, records, lambda: _workers(workers, ray), checkpoints, tensorboard, quiet)
+    pool = partial(_workers, workers, ray, device)
+    went_well = do_runs(chosen, records, pool, checkpoints, tensorboard, quiet)
     if not changes:  # the board shows no run with changed settings
         print_plain(console, _next(records))
     if not went_well:
@@ -272,12 +276,12 @@ def _part(shard: str, runs: Sequence[ResolvedRun]) -> Sequence[ResolvedRun]:
     return runs[begin:end]
 
 
-def _workers(count: int | None, ray: str | None) -> Workers:
+def _workers(count: int | None, ray: str | None, device: str) -> Workers:
     """Return the workers that do the runs: processes of this machine, or a Ray cluster at an address."""
     if ray is None:
         from clbench.jobs.processes import Processes
 
-        return Processes(count)
+        return Processes(count, device)
     from clbench.jobs.ray import RayWorkers
 
     with checked_input():

@@ -82,8 +82,9 @@ def tune(
         values: Hyper-parameters and the values to try, as --values.tau_start 0.3,1,3
         targets: Number of targets to learn, from the first, with --values (default: all). The
             records of such runs go to a separate folder, for example targets-1 below --records.
-        workers: Number of runs at once, each a process with one thread (default: all cores).
-        device: Device that runs the policies, for example cpu or cuda.
+        workers: Number of runs at once, each a process with one thread (default: all cores; with --device
+            cuda, all GPUs).
+        device: Device that runs the policies, for example cpu or cuda, which gives each run one of the GPUs.
         policy: flow, discrete_diffusion, or a class of your own as module:Class.
         policy_size: small, base (5 million parameters) or large (40 million), for built-in policies.
         records: Folder of the records.
@@ -216,7 +217,7 @@ def _run(
             name: _resolved(replace(first, method=name), settings, seeds) for name, settings in wanted.items()
         }
     every = [one for groups in runs.values() for group in groups for one in group]
-    succeeded = do_runs(every, records, lambda: Processes(workers))
+    succeeded = do_runs(every, records, lambda: Processes(workers, first.device))
     with checked_input():
         if not succeeded and not all(has_failed(one, records) or has_record(one, records) for one in every):
             sys.exit(1)  # the machine failed, not a method: the same command goes on

@@ -201,7 +201,8 @@ def run(
         policy: Name of the policy, such as "discrete_diffusion", "flow-base" or "module:Class".
         perturb: Whether the skills and each new target are also evaluated in perturbed worlds.
         records: Folder of the records.
-        workers: Number of runs at once, each a process with one thread; all cores if None.
+        workers: Number of runs at once, each a process with one thread; all cores if None, or all GPUs with
+            the device "cuda".
         device: Device that runs the policies, for example "cpu" or "cuda".
 
     Raises:
@@ -245,7 +246,8 @@ def run_specs(firsts: Sequence[RunSpec], seeds: int, records: Path, workers: int
     # other processes cannot import the class, but can make what its runs need
     needed = missing(typed, records, None).plan(records, None).inputs
     failed = run_with_bars(needed, Processes(workers), console) if needed else {}
-    failed |= run_missing(others, records, lambda: Processes(workers), console) if others else {}
+    device = firsts[0].device
+    failed |= run_missing(others, records, lambda: Processes(workers, device), console) if others else {}
     failed |= run_missing(typed, records, Here, console) if typed else {}
     if failed:
         raise RunsFailedError("\n".join(f"{job}: {reason}" for job, reason in failed.items()))

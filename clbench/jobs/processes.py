@@ -35,11 +35,27 @@ _LEAVE_SECONDS = 5.0
 _CLOSE_SECONDS = 3.0
 
 
+def at_once(device: str) -> int:
+    """Return how many jobs run at once on a device, unless the user says: one per core, or one per GPU."""
+    return cores() if device == "cpu" else max(1, len(_gpus())) if device == "cuda" else 1
+
+
+def _gpus() -> list[str]:
+    """Return the names of the GPUs that this process may use, as `CUDA_VISIBLE_DEVICES` lists them."""
+    import torch  # takes a second to import
+
+    count = torch.cuda.device_count()
+    names = os.environ.get("CUDA_VISIBLE_DEVICES")
+    return [str(number) for number in range(count)] if names is None else names.split(",")[:count]
+
+
 @dataclass
 class _Worker:
     job: Job
     process: BaseProcess
     connection: Connection
+    gpu: str | None
+    """Name of the GPU that is its "cuda"; None if it computes elsewhere."""
     started: float = field(default_factory=time.monotonic)
     looked: float = field(default_factory=time.monotonic)
     broken: str | None = None
@@ -52,11 +68,12 @@ class Processes:
     """Workers on this machine.
 
     Args:
-        count: Number of jobs that run at once; one per core if None.
+        count: Number of jobs that run at once; `at_once` of the device if None.
+        device: Device on which runs compute.
     """
 
-    def __init__(self, count: int | None = None) -> None:
-        self._count = count or cores()
+    def __init__(self, count: int | None = None, device: str = "cpu") -> None:
+        self._count = count or at_once(device)
         self._running: dict[Connection, _Worker] = {}
         self._handles_suspension = _handles_suspension()
         if self._handles_suspension:
@@ -67,9 +84,11 @@ class Processes:
         return self._count - len(self._running)
 
     def start(self, job: Job) -> None:
-        """Start a job in its own process."""
+        """Start a job in its own process, and on a GPU of its own as far as there are enough."""
+        used = [worker.gpu for worker in self._running.values()]
+        gpu = min(_gpus(), key=used.count, default=None) if job.device == "cuda" else None
         with _signals_held_back():
-            worker = _start(job)
+            worker = _start(job, gpu)
             self._running[worker.connection] = worker
 
     def events(self) -> Iterator[Event]:
@@ -258,17 +277,19 @@ def _context() -> Any:
     return context
 
 
-def _start(job: Job) -> _Worker:
+def _start(job: Job, gpu: str | None) -> _Worker:
     context = _context()
     ours, theirs = context.Pipe(duplex=False)
     environment = {**os.environ, **absolute_places()}
+    if gpu is not None:
+        environment["CUDA_VISIBLE_DEVICES"] = gpu
     process = context.Process(
         target=_work, args=(theirs, job.function, job.arguments, environment), daemon=True
     )
     with _script_hidden():
         process.start()
     theirs.close()  # so that the end of the process is the end of the stream
-    return _Worker(job, process, ours)
+    return _Worker(job, process, ours, gpu)
 
 
 def _receive(worker: _Worker) -> tuple[Any, Any]:

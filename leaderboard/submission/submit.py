@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -44,7 +45,8 @@ def run_submission(
     """
     console, name = Console(stderr=True), runs[0].spec.method
     check = Job("check", check_job, {"method": name}, CHECK_STEPS, limits=runs[0].scenario.limits)
-    failed = run_missing(runs, records, lambda: Processes(workers), console, checkpoints, check=check)
+    pool = partial(Processes, workers, runs[0].spec.device)
+    failed = run_missing(runs, records, pool, console, checkpoints, check=check)
     if check in failed:
         print_plain(console, f"No run was started: {name} breaks the contract.")
         return None

@@ -1,5 +1,6 @@
 """Processes of jobs: what a job does to its process and begins beside it ends with the job."""
 
+import dataclasses
 import importlib
 import os
 import signal
@@ -18,8 +19,9 @@ from clbench.base.cache import cache_folder
 from clbench.jobs.bars import Bars
 from clbench.jobs.folders import minari_folder
 from clbench.jobs.job import Job, Product
-from clbench.jobs.processes import Here, Processes
+from clbench.jobs.processes import Here, Processes, at_once
 from clbench.jobs.scheduler import run_jobs
+from clbench.worlds.threads import cores
 
 JOBS = """
 import multiprocessing, os, signal, subprocess, time
@@ -52,6 +54,9 @@ def has_a_helper(progress):
     helper.start()
     helper.join()
     return f"its helper ended with {helper.exitcode}"
+
+def names_its_gpu(progress):
+    return f"on GPU {os.environ.get('CUDA_VISIBLE_DEVICES')}"
 
 def ends_by(progress, number):
     os.kill(os.getpid(), number)
@@ -223,3 +228,19 @@ def _all_become(processes: list[int], *, stopped: bool) -> bool:
             return True
         time.sleep(0.1)
     return False
+
+
+def test_runs_on_cuda_have_a_gpu_each_and_as_many_go_at_once(
+    bars: Bars, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,MIG-5,6")
+    assert (at_once("cuda"), at_once("cuda:1"), at_once("cpu")) == (2, 1, cores())
+    workers = Processes(device="cuda")
+    assert workers.free() == 2
+    elsewhere = _job("names_its_gpu")
+    runs = [dataclasses.replace(elsewhere, title=f"run {n}", length=4 - n, device="cuda") for n in range(3)]
+    assert run_jobs([*runs, elsewhere], workers, bars) == {}
+    lines = [line.partition(" (")[0] for line in printed(bars).splitlines()]
+    assert sorted(lines[:2]) == ["run 0: on GPU 3", "run 1: on GPU MIG-5"]
+    assert "names_its_gpu: on GPU 3,MIG-5,6" in lines
