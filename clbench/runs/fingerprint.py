@@ -107,22 +107,25 @@ def _hardware(device: str) -> dict[str, str]:
         **gpu,
         "machine": platform.machine(),
         "system": platform.system(),
-        "processor": _processor(),
+        "processor": _cpu_info("model name") or platform.processor(),
         "instructions": torch.backends.cpu.get_cpu_capability(),
     }
 
 
 def arithmetic(device: str) -> dict[str, str]:
-    """Return the hardware that decides the bits of a run: one that changes it midway cannot be repeated."""
-    hardware = _hardware(device)
-    return {name: hardware[name] for name in ("gpu", "machine", "instructions") if name in hardware}
+    """Return the hardware that decides the bits of a run: one that changes it midway cannot be repeated.
+
+    The maker of the processor counts, because MKL, which multiplies PyTorch's matrices, has other code for
+    Intel's processors than for others with the same instructions.
+    """
+    hardware = {**_hardware(device), "maker": _cpu_info("vendor_id")}
+    return {name: hardware[name] for name in ("gpu", "machine", "maker", "instructions") if name in hardware}
 
 
-def _processor() -> str:
-    """Return the model of the processor."""
+def _cpu_info(field: str) -> str:
+    """Return a field of Linux's description of the first processor, empty if there is none."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
-        return platform.processor()
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor()
+        return ""
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith(field)), "")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from clbench.runs.fingerprint import fingerprint, rollout_hash
+from clbench.runs.fingerprint import arithmetic, fingerprint, rollout_hash
 from clbench.spec.registry import load_scenario
 
 TOY = load_scenario("clbench.testing:clbench/Toy-v0")
@@ -92,6 +92,18 @@ def test_a_fingerprint_names_only_the_simulator_of_its_suite() -> None:
 def test_a_run_on_a_gpu_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.cuda.get_device_name", {"cuda:1": "H100"}.__getitem__)
     assert fingerprint(TOY, "cuda:1")["hardware"]["gpu"] == "H100"
+
+
+def test_processors_of_two_makers_compute_otherwise_with_the_same_instructions(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = []
+    for maker in ("GenuineIntel", "AuthenticAMD", "AuthenticAMD"):
+        text = f"processor\t: 0\nvendor_id\t: {maker}\nmodel name\t: One\n"
+        monkeypatch.setattr(Path, "read_text", lambda *_, text=text, **__: text)
+        found.append(arithmetic("cpu"))
+    assert found[0] != found[1] == found[2]
+    assert {**found[0], "maker": None} == {**found[1], "maker": None}
 
 
 def test_a_fingerprint_names_versions_hardware_and_every_world() -> None:
