@@ -1,4 +1,4 @@
-"""Ctrl-C that cannot get lost.
+"""Ctrl-C, and other signals that stop a command, which cannot get lost.
 
 Python raises KeyboardInterrupt wherever the main thread happens to be. In a destructor or a callback the
 exception is printed and dropped, and a library may swallow it. The handler therefore also remembers it: long
@@ -13,10 +13,11 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Iterable
 from types import FrameType
 
-_interrupted_at: float | None = None
-"""Time of the first Ctrl-C."""
+_first: tuple[int, float] | None = None
+"""Number and time of the first signal."""
 
 _AGAIN_SECONDS = 0.01
 
@@ -24,30 +25,40 @@ _IMPORT_SECONDS = 10.0
 """PyTorch is imported in 1 s, on a busy machine in several. One that never ends must not block Ctrl-C."""
 
 
-def install() -> None:
-    """Remember each Ctrl-C from now on, and raise it again if a destructor or a callback dropped it."""
-    global _interrupted_at
-    _interrupted_at = None  # an earlier command in this process may have been stopped
-    signal.signal(signal.SIGINT, _handle)
+def install(numbers: Iterable[int] = (signal.SIGINT,)) -> None:
+    """Let signals raise KeyboardInterrupt, again if a destructor or a callback dropped it, and remember them.
+
+    Args:
+        numbers: The signals.
+    """
+    global _first
+    _first = None  # an earlier command in this process may have been stopped
+    for number in numbers:
+        signal.signal(number, _handle)
     sys.unraisablehook = _raise_again
 
 
+def stopped_by() -> int | None:
+    """Return the number of the signal that came first, None if none came."""
+    return None if _first is None else _first[0]
+
+
 def check() -> None:
-    """Raise the Ctrl-C that came earlier, if it got lost.
+    """Raise the Ctrl-C, or what another signal raised, that came earlier, if it got lost.
 
     Raises:
         KeyboardInterrupt: There was one.
     """
-    if _interrupted_at is not None:
+    if _first is not None:
         raise KeyboardInterrupt
 
 
 def _handle(number: int, frame: FrameType | None) -> None:
-    global _interrupted_at
+    global _first
     now = time.monotonic()
-    if _interrupted_at is None:
-        _interrupted_at = now
-    if _imports(frame) and now - _interrupted_at < _IMPORT_SECONDS:
+    if _first is None:
+        _first = number, now
+    if _imports(frame) and now - _first[1] < _IMPORT_SECONDS:
         _soon_again()
     else:
         raise KeyboardInterrupt
@@ -74,9 +85,9 @@ def _soon_again() -> None:
 
 
 def _interrupt_main() -> None:
-    """Send SIGINT to the main thread, from another thread."""
-    main = threading.main_thread().ident
+    """Send the signal to the main thread again, from another thread."""
+    main, number = threading.main_thread().ident, stopped_by() or signal.SIGINT
     if hasattr(signal, "pthread_kill") and main is not None:
-        signal.pthread_kill(main, signal.SIGINT)  # also interrupts a system call, such as a sleep
+        signal.pthread_kill(main, number)  # also interrupts a system call, such as a sleep
     else:
-        _thread.interrupt_main()
+        _thread.interrupt_main(number)

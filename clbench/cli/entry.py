@@ -1,4 +1,4 @@
-"""The entry point of the command `clbench`: Ctrl-C ends it at any moment, without a traceback."""
+"""The entry point of the command `clbench`: Ctrl-C or SIGTERM ends it at any moment, without a traceback."""
 
 from __future__ import annotations
 
@@ -8,23 +8,19 @@ import io
 import os
 import signal
 import sys
-from collections.abc import Callable
-from types import FrameType
 
 from clbench.base import interrupts
 
-INTERRUPTED = 128 + signal.SIGINT
-"""Exit code after Ctrl-C, as shells report it."""
-
-_STOPS = [signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
-"""Signals of a scheduler that ends the command, and of a terminal that closes: workers do not get them."""
+_STOPS = [signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
+"""Signals of Ctrl-C, of a scheduler that ends the command, and of a terminal that closes."""
 
 
 def main() -> None:
     """Run the command line.
 
-    While the command works, Ctrl-C raises KeyboardInterrupt, so that it can clean up. Before and after, there
-    is nothing to clean up: the process ends at once.
+    While the command works, these signals raise KeyboardInterrupt, so that it can clean up and end its
+    workers. Before and after, there is nothing to clean up: the process ends at once. The exit code is 128
+    and the number of the signal, as shells report it.
     """
     _end_at_once_when_stopped()
     if sys.stdout is None:  # it was closed: >&-
@@ -36,10 +32,7 @@ def main() -> None:
 
     try:
         try:
-            if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-                interrupts.install()
-            for stop in _STOPS:  # they end the workers too, as Ctrl-C does
-                _handle(stop, lambda number, _: sys.exit(128 + number))
+            interrupts.install(_heeded())
             run_command()
         finally:
             with contextlib.suppress(OSError, ValueError):  # a closed pipe
@@ -55,30 +48,22 @@ def main() -> None:
         sys.exit(1)
     except BaseException:
         # an import can turn the KeyboardInterrupt into an ImportError, a command into an error of its own
-        if not _interrupted():
+        if interrupts.stopped_by() is None:
             raise
-    if _interrupted():
+    number = interrupts.stopped_by()
+    if number is not None:
         _end_at_once_when_stopped()
-        print("Stopped. Finished records are kept; repeat the command to continue.", file=sys.stderr)  # noqa: T201
-        sys.exit(INTERRUPTED)
+        with contextlib.suppress(OSError):  # the terminal may be closed
+            print("Stopped. Finished records are kept; repeat the command to continue.", file=sys.stderr)  # noqa: T201
+        sys.exit(128 + number)
 
 
-def _interrupted() -> bool:
-    """Return whether Ctrl-C came."""
-    try:
-        interrupts.check()
-    except KeyboardInterrupt:
-        return True
-    return False
-
-
-def _handle(number: signal.Signals, handler: Callable[[int, FrameType | None], object]) -> None:
-    """Set the handler of a signal, unless the process was started to ignore the signal."""
-    if signal.getsignal(number) is not signal.SIG_IGN:
-        signal.signal(number, handler)
+def _heeded() -> list[signal.Signals]:
+    """Return the signals that stop the command; a process may be started to ignore some of them."""
+    return [number for number in _STOPS if signal.getsignal(number) is not signal.SIG_IGN]
 
 
 def _end_at_once_when_stopped() -> None:
-    """Let Ctrl-C and SIGTERM end the process at once, without Python's clean-up at the end."""
-    for number in (signal.SIGINT, *_STOPS):
-        _handle(number, lambda number, _: os._exit(128 + number))
+    """Let the signals end the process at once, without Python's clean-up at the end."""
+    for number in _heeded():
+        signal.signal(number, lambda number, _: os._exit(128 + number))

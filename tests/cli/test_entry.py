@@ -91,12 +91,16 @@ def test_ctrl_c_at_any_moment_ends_the_command(number: int) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("function", ["command", "converted", "late"])
-def test_ctrl_c_is_neither_dropped_nor_turned_into_another_error(function: str) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_and_sigterm_are_neither_dropped_nor_turned_into_another_error(
+    number: signal.Signals, function: str
+) -> None:
     process = _start(STUBBORN.format(function))
     _wait_for(process, "waiting")
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     code, out, err = _exit_code(process)
-    assert code == 130
+    assert code == 128 + number
+    assert ("Stopped. Finished records are kept" in err) == (function != "late")
     assert "Traceback" not in err
     assert out == ("done\n" if function == "late" else "")
 

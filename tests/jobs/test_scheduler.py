@@ -395,7 +395,7 @@ def _is_gone(group: int) -> bool:
     ("send", "stop", "code", "said"),
     [
         pytest.param(os.killpg, signal.SIGINT, 130, "Finished records are kept", id="ctrl-c"),
-        pytest.param(os.kill, signal.SIGTERM, 143, "", id="scheduler"),
+        pytest.param(os.kill, signal.SIGTERM, 143, "Finished records are kept", id="scheduler"),
     ],
 )
 @pytest.mark.slow
