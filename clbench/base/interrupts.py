@@ -90,4 +90,4 @@ def _interrupt_main() -> None:
     if hasattr(signal, "pthread_kill") and main is not None:
         signal.pthread_kill(main, number)  # also interrupts a system call, such as a sleep
     else:
-        _thread.interrupt_main(number)
+        _thread.interrupt_main(signal.Signals(number))

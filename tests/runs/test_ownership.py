@@ -188,7 +188,7 @@ class _Computes(Method):
 
     def end_task(self, policy: Policy, stage: Any) -> None:
         error = torch.AcceleratorError("CUDA error: uncorrectable ECC error\nCompile with TORCH_USE_CUDA_DSA")
-        error.error_code = self._code
+        error.error_code = self._code  # type: ignore[attr-defined]
         raise error
 
 
