@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from helpers import back_end_or_skip
 from numpy.typing import NDArray
 
 from clbench.base.entry_points import resolve
@@ -242,8 +243,7 @@ def test_questions_describe_a_scene_correctly() -> None:
 
 @pytest.mark.long
 def test_the_world_is_drawn_with_the_target_of_its_task() -> None:
-    if not _draws():
-        pytest.skip("nothing renders here: clbench doctor shows the missing parts")
+    back_end_or_skip()
     drawn: World = resolve(SCENARIO.tasks[0].world)(render_mode="rgb_array")
     pictures = []
     for task in ("point_mass_easy", "point_mass_right", "cartpole_balance", "ball_in_cup_catch"):
@@ -256,16 +256,6 @@ def test_the_world_is_drawn_with_the_target_of_its_task() -> None:
     # the same state, except the mark
     differing = (pictures[0] != pictures[1]).any(axis=2)
     assert 0 < differing.mean() < 0.02
-
-
-def _draws() -> bool:
-    from clbench.worlds.gl_backend import RenderingError, choose_back_end
-
-    try:
-        choose_back_end([SCENARIO.tasks[0].world])
-    except RenderingError:
-        return False
-    return True
 
 
 def test_a_step_before_the_first_reset_is_refused() -> None:

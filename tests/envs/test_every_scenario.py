@@ -17,18 +17,18 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from helpers import expert_succeeds
+from helpers import back_end_or_skip, expert_succeeds
 from numpy.typing import NDArray
 
+from clbench.base.dependencies import require_packages
 from clbench.base.entry_points import resolve
-from clbench.base.errors import InputError
+from clbench.base.errors import InputError, MissingPackageError
 from clbench.data.questions import load_questions
 from clbench.spec.identifiers import scenario_ids
 from clbench.spec.language import spelled_words
 from clbench.spec.registry import registered_scenario
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
-from clbench.worlds.gl_backend import RenderingError
 from clbench.worlds.lanes import Lanes, check_perturbable, vector_world
 from clbench.worlds.scenario_env import ScenarioEnv
 from clbench.worlds.world import World
@@ -50,22 +50,22 @@ QUICK = ("clbench/Fetch-v1", "clbench/MetaWorld-v1")
 Rows = NDArray[np.float64]
 
 
-def make(entry_point: str) -> World:
+def make(task: Task) -> World:
+    """Return the world of a task, or skip the test where a package that it needs is not installed."""
     try:
-        world: World = resolve(entry_point)()
-    except (ImportError, LookupError) as fault:
-        pytest.skip(str(fault))
+        require_packages(task.packages, task.name)
+    except MissingPackageError as error:
+        pytest.skip(str(error))
+    world: World = resolve(task.world)()
     return world
 
 
 def make_environment(scenario: Scenario, **options: Any) -> ScenarioEnv:
-    make(scenario.tasks[0].world).close()
+    make(scenario.tasks[0]).close()
+    if scenario.tasks[0].camera is not None:
+        back_end_or_skip()
     environment = gymnasium.make(scenario.id, **options).unwrapped
     assert isinstance(environment, ScenarioEnv)
-    try:
-        environment.reset(seed=0)
-    except RenderingError as fault:
-        pytest.skip(str(fault))
     return environment
 
 
@@ -146,7 +146,7 @@ def test_gymnasiums_own_check_passes(scenario: Scenario, instruction: str) -> No
 @every_scenario
 def test_gymnasiums_own_check_passes_for_its_worlds(scenario: Scenario) -> None:
     for task in first_task_of_each_world(scenario):
-        check(make(task.world))
+        check(make(task))
 
 
 @every_scenario
@@ -167,7 +167,7 @@ def test_it_takes_two_hundred_random_steps(scenario: Scenario) -> None:
 
 @every_task
 def test_an_episode_repeats_itself_whatever_ran_before(task: Task) -> None:
-    world, expected = make(task.world), rollout(make(task.world), task.name, seed=7)
+    world, expected = make(task), rollout(make(task), task.name, seed=7)
     others = [name for entry_point, name in TASKS if entry_point == task.world][-2:]
     for other, seed in (*itertools.product(others, (1, 7)), (task.name, 2)):
         rollout(world, other, seed, steps=31)
@@ -177,7 +177,7 @@ def test_an_episode_repeats_itself_whatever_ran_before(task: Task) -> None:
 
 @every_task
 def test_a_copy_of_a_world_goes_on_as_the_world_does_and_leaves_it_alone(task: Task) -> None:
-    world, expected = make(task.world), rollout(make(task.world), task.name, seed=2)
+    world, expected = make(task), rollout(make(task), task.name, seed=2)
     world.reset(seed=2, options={"task": task.name})
     chosen = actions(world, 2, 20)
     moved(world, chosen[:10])
@@ -187,16 +187,16 @@ def test_a_copy_of_a_world_goes_on_as_the_world_does_and_leaves_it_alone(task: T
 
 @every_task
 def test_global_generators_have_no_part_in_it_and_are_left_alone(task: Task) -> None:
-    expected = rollout(make(task.world), task.name, seed=3)
+    expected = rollout(make(task), task.name, seed=3)
     np.random.seed(5)  # noqa: NPY002
     before = np.random.get_state()[1].copy()  # type: ignore[index]  # noqa: NPY002
-    np.testing.assert_array_equal(rollout(make(task.world), task.name, seed=3), expected)
+    np.testing.assert_array_equal(rollout(make(task), task.name, seed=3), expected)
     np.testing.assert_array_equal(np.random.get_state()[1], before)  # type: ignore[index]  # noqa: NPY002
 
 
 @every_scenario
 def test_an_episode_without_a_seed_continues_the_random_numbers(scenario: Scenario) -> None:
-    world = make(scenario.tasks[0].world)
+    world = make(scenario.tasks[0])
     first, second = world.reset(seed=5)[0], world.reset()[0]
     assert not np.array_equal(first, second)
     world.reset(seed=5)
@@ -206,7 +206,7 @@ def test_an_episode_without_a_seed_continues_the_random_numbers(scenario: Scenar
 @every_scenario
 def test_episodes_side_by_side_equal_the_plain_world_bit_for_bit(scenario: Scenario) -> None:
     tasks = [*scenario.tasks[:2], *scenario.tasks[-3:]]
-    plain, lanes = [make(task.world) for task in tasks], Lanes(5, threads=2)
+    plain, lanes = [make(task) for task in tasks], Lanes(5, threads=2)
     states = lanes.reset([4, 2, 0], [4, 2, 0], [tasks[4], tasks[2], tasks[0]])
     for row, lane in enumerate([4, 2, 0]):
         state, _ = plain[lane].reset(seed=lane, options={"task": tasks[lane].name})
@@ -240,7 +240,7 @@ def test_a_perturbed_episode_follows_from_its_seed_in_any_lane_and_changes_no_pl
     scenario: Scenario,
 ) -> None:
     for task in first_task_of_each_world(scenario):
-        make(task.world).close()
+        make(task).close()
     check_perturbable(scenario.tasks)
     for task in (*scenario.tasks[:1], *scenario.tasks[-2:]):
         plain, perturbed = (steps(Lanes(1), 0, task, 7, flag) for flag in (False, True))
@@ -261,7 +261,7 @@ def test_a_perturbed_episode_follows_from_its_seed_in_any_lane_and_changes_no_pl
 
 @every_task
 def test_the_expert_does_its_task(task: Task) -> None:
-    make(task.world).close()
+    make(task).close()
     # LIBERO's experts succeed in 96 % of their episodes or more, all others in these four for certain
     least = 3 if "libero" in task.world else 4
     assert sum(expert_succeeds(task, seed) for seed in range(100, 104)) >= least
@@ -282,7 +282,7 @@ HARD_IF_PERTURBED = {
 def test_experts_do_the_tasks_in_perturbed_worlds_too(scenario: Scenario) -> None:
     episodes = 40
     for task in (*scenario.retained, *scenario.target):
-        make(task.world).close()
+        make(task).close()
         expert, lanes = resolve(task.expert)(task.name), Lanes(episodes)
         going, done = list(range(episodes)), 0
         states = lanes.reset(going, list(range(episodes)), [task] * episodes, [True] * episodes)
@@ -301,7 +301,7 @@ def test_experts_do_the_tasks_in_perturbed_worlds_too(scenario: Scenario) -> Non
 def test_worlds_that_threads_use_at_the_same_time_change_nothing(
     scenario: Scenario,
 ) -> None:
-    make(scenario.tasks[0].world).close()
+    make(scenario.tasks[0]).close()
     tasks = [task for task in scenario.tasks if task.world == scenario.tasks[0].world]
 
     def states(number: int) -> list[NDArray[np.float32]]:
@@ -326,7 +326,7 @@ def test_worlds_that_threads_use_at_the_same_time_change_nothing(
 
 @every_scenario
 def test_no_task_is_done_at_the_start(scenario: Scenario) -> None:
-    worlds = {task.world: make(task.world) for task in scenario.tasks}
+    worlds = {task.world: make(task) for task in scenario.tasks}
     for task in scenario.tasks:
         world = worlds[task.world]
         for seed in range(5):
@@ -340,7 +340,7 @@ def test_an_unknown_task_is_an_error_that_names_the_nearest(scenario: Scenario) 
     task = scenario.tasks[0]
     message = f"{task.name}x'.* Did you mean '{task.name}'"
     with pytest.raises(LookupError, match=message):
-        make(task.world).reset(options={"task": f"{task.name}x"})
+        make(task).reset(options={"task": f"{task.name}x"})
     with pytest.raises(LookupError, match=message):
         vector_world(task.world, 1).reset([0], [0], [f"{task.name}x"])
     with pytest.raises(LookupError, match=message):
@@ -350,7 +350,7 @@ def test_an_unknown_task_is_an_error_that_names_the_nearest(scenario: Scenario) 
 @every_scenario
 def test_an_impossible_action_is_an_error_that_names_it(scenario: Scenario) -> None:
     for task in first_task_of_each_world(scenario):
-        plain, lanes = make(task.world), Lanes(2)
+        plain, lanes = make(task), Lanes(2)
         plain.reset(seed=0, options={"task": task.name})
         lanes.reset([0, 1], [0, 1], [task, task])
         good = actions(plain, 0, 1)[0] * 0
@@ -379,7 +379,7 @@ def test_an_impossible_action_is_an_error_that_names_it(scenario: Scenario) -> N
 @every_scenario
 def test_actions_beyond_the_bounds_are_cut(scenario: Scenario) -> None:
     for task in first_task_of_each_world(scenario):
-        world, states = make(task.world), []
+        world, states = make(task), []
         for far in (1.0, 9.0, 1e300):  # the last is finite, but too large for a number of 32 bits
             world.reset(seed=0, options={"task": task.name})
             action = np.full(world.action_space.shape or (), far)
@@ -392,7 +392,7 @@ def test_actions_beyond_the_bounds_are_cut(scenario: Scenario) -> None:
 @every_scenario
 def test_a_lane_without_an_episode_is_named(scenario: Scenario) -> None:
     for task in first_task_of_each_world(scenario):
-        action = actions(make(task.world), 0, 1)[0]
+        action = actions(make(task), 0, 1)[0]
         world = vector_world(task.world, 2)
         world.reset([0], [0], [task.name])
         with pytest.raises(gymnasium.error.ResetNeeded, match=r"Lane 1 of the .* has no episode: reset it"):
@@ -419,7 +419,7 @@ def test_instructions_and_questions_are_plain_words_of_the_vocabulary(scenario: 
 
 @every_scenario
 def test_questions_answer_many_states_as_they_answer_each(scenario: Scenario) -> None:
-    episodes = [rollout(make(task.world), task.name, seed=3) for task in scenario.scene_tasks[:2]]
+    episodes = [rollout(make(task), task.name, seed=3) for task in scenario.scene_tasks[:2]]
     states = np.concatenate(episodes)[:, :-1].astype(np.float32)
     for kind in resolve(scenario.questions):
         answers = kind.answer(states)
@@ -432,7 +432,7 @@ def test_questions_answer_many_states_as_they_answer_each(scenario: Scenario) ->
 @pytest.mark.slow
 def test_scenes_of_background_tasks_give_the_answers_that_retained_skills_lack() -> None:
     scenario = registered_scenario("clbench/MetaWorld-v1")
-    make(scenario.tasks[0].world).close()
+    make(scenario.tasks[0]).close()
     few = dataclasses.replace(scenario, budget=dataclasses.replace(scenario.budget, question_episodes=64))
     assert all(questions.kinds for questions in load_questions(few))
     with pytest.raises(InputError, match="No state answers 'left' to 'target_side_of_object'"):

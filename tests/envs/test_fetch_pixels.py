@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import back_end_or_skip
 from numpy.typing import NDArray
 
 from clbench.base.entry_points import resolve
 from clbench.spec.language import spelled_words
 from clbench.spec.registry import load_scenario
-from clbench.worlds.gl_backend import RenderingError
 from clbench.worlds.observation import Observer
 from clbench.worlds.scenario_env import ScenarioEnv
 
@@ -30,11 +30,8 @@ COLOURS = ("green", "blue", "yellow", "purple")
 @pytest.fixture(scope="module")
 def observer() -> Iterator[Observer]:
     """Return the observer of the pixel world, or skip without graphics."""
+    back_end_or_skip()
     observer = Observer(WORLD, CAMERA)
-    try:
-        observer.observe(_start(0)[None])
-    except RenderingError as error:
-        pytest.skip(str(error))
     yield observer
     observer.close()
 

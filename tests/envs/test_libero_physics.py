@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import back_end_or_skip
 from numpy.typing import NDArray
 
 pytest.importorskip("libero", reason="pip install 'clbench[libero]'")
 
 from clbench.base.entry_points import resolve
 from clbench.base.errors import UnknownNameError
-from clbench.worlds.gl_backend import rendering_fault
 
 ORIGINAL = "clbench.envs.libero.original"
 TASKS = resolve(f"{ORIGINAL}:TASKS")
@@ -130,9 +130,7 @@ print("equal")
 @pytest.mark.slow
 @pytest.mark.parametrize("angle", [0.0, 0.6])
 def test_pictures_equal_liberos_upside_down(angle: float) -> None:
-    environment = {**os.environ, "MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
-    if rendering_fault(environment["MUJOCO_GL"]) is not None:
-        pytest.skip("nothing renders here: clbench doctor shows the missing parts")
+    environment = {**os.environ, "MUJOCO_GL": back_end_or_skip()}
     command = [sys.executable, "-c", PICTURES, "turn_on_the_stove", str(angle)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.stdout.endswith("equal\n"), done.stderr

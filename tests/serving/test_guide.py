@@ -15,10 +15,10 @@ import gymnasium
 import numpy as np
 import pytest
 from agents import ID
-from helpers import blocks_of
+from helpers import blocks_of, scenario_or_skip
 from served import SERVER
 
-from clbench.base.errors import ClbenchError, MissingPackageError
+from clbench.base.errors import MissingPackageError
 from clbench.runs.spec import describe_scenario
 from clbench.serving.client import ServedPolicy
 from clbench.spec.identifiers import scenario_ids
@@ -81,11 +81,7 @@ def test_the_page_lists_the_sizes_of_all_scenarios_that_retain_skills() -> None:
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: str(row[0]))
 def test_the_sizes_on_the_page_are_those_of_the_scenario(row: tuple[str, ...]) -> None:
     name, state, action, picture, fewest, most = row
-    try:
-        scenario = load_scenario(f"clbench/{name}")
-        scenario.require_packages()
-    except ClbenchError as error:
-        pytest.skip(str(error))
+    scenario = scenario_or_skip(f"clbench/{name}")
     env = gymnasium.make(scenario.id, stage=0)
     assert isinstance(env.observation_space, gymnasium.spaces.Dict)
     spaces = {key: space.shape for key, space in env.observation_space.items()}

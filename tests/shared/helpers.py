@@ -2,19 +2,23 @@
 
 import base64
 import dataclasses
+import functools
 import gzip
 import io
 import json
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from torch import Tensor
 
 from clbench.base.entry_points import resolve
+from clbench.base.errors import MissingPackageError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.data.demonstrations import Demonstration
 from clbench.jobs.bars import Bars
@@ -28,7 +32,36 @@ from clbench.records.writer import write_record
 from clbench.runs.spec import ResolvedRun
 from clbench.runs.stages import kept_stages, load_stages, make_stages
 from clbench.scoring.reading import read_protocol
+from clbench.spec.registry import load_scenario
+from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
+from clbench.worlds.gl_backend import DEBIAN_PACKAGES, rendering_fault
+
+
+def scenario_or_skip(scenario_id: str) -> Scenario:
+    """Return a scenario, or skip the test where a package that it needs is not installed."""
+    try:
+        return load_scenario(scenario_id)
+    except MissingPackageError as error:
+        pytest.skip(str(error))
+
+
+def back_end_or_skip() -> str:
+    """Return a back end of MuJoCo that works on this machine, or skip the test.
+
+    Only a rendering context is tried: a world that cannot be drawn is a bug, and its test must fail.
+    """
+    back_end = _working_back_end()
+    if back_end is None:
+        pytest.skip("nothing renders here: clbench doctor shows the missing parts")
+    return back_end
+
+
+@functools.cache
+def _working_back_end() -> str | None:
+    chosen = os.environ.get("MUJOCO_GL")
+    back_ends = (chosen,) if chosen else tuple(DEBIAN_PACKAGES)
+    return next((one for one in back_ends if rendering_fault(one) is None), None)
 
 
 def build_method(spec: str, changes: Mapping[str, Any]) -> Method:

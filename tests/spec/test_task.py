@@ -6,10 +6,10 @@ from typing import Any
 
 import gymnasium
 import pytest
+from helpers import scenario_or_skip
 
 from clbench.base.dependencies import require_packages
 from clbench.base.entry_points import resolve
-from clbench.base.errors import MissingPackageError
 from clbench.spec.budget import Budget
 from clbench.spec.identifiers import scenario_ids
 from clbench.spec.registry import load_scenario, registered_scenario
@@ -49,10 +49,7 @@ def test_an_unknown_task_is_answered_with_the_nearest() -> None:
 
 @pytest.mark.parametrize("scenario_id", scenario_ids())
 def test_a_scenario_has_distinct_tasks_whose_entry_points_resolve(scenario_id: str) -> None:
-    try:
-        scenario = load_scenario(scenario_id)
-    except MissingPackageError as error:
-        pytest.skip(str(error))
+    scenario = scenario_or_skip(scenario_id)
     names = [task.name for task in scenario.tasks]
     assert len(set(names)) == len(names)
     assert scenario.scene_tasks
