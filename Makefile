@@ -173,7 +173,7 @@ CHECKED := tests/leaderboard/test_records.py tests/evaluation/test_definition.py
 	tests/scoring/test_statistics_page.py tests/base/test_source.py \
 	$(addprefix tests/leaderboard/views/page/test_,in_browser.py on_a_phone.py published_page.py ways.py)
 committed: .venv/installed-dev
-	$(BIN)/pytest -m slow $(CHECKED)
+	$(BIN)/pytest -m "slow or long" $(CHECKED)
 
 # Tests of the built wheel outside the checkout, where it could differ from the checkout: its files, the parts that are
 # found by name, the commands, and all that strangers type. It has an environment of its own, which sees the packages of

@@ -34,7 +34,7 @@ def test_every_scenario_of_the_project_is_pinned_unless_it_depends_on_the_proces
 
 
 CHECKED = ("clbench/FetchKnowledge-v1", "clbench/FetchPixels-v0", "clbench/MetaWorldCW-v0")
-"""They take 28 s, in suites that others stand for in `make test-long`; `make check` defines every scenario."""
+"""They take 28 s, and others stand for their suites in `make test-long`; `make check` defines all."""
 
 
 @pytest.mark.long
