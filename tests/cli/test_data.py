@@ -72,7 +72,6 @@ def test_what_is_no_policy_is_refused_in_one_line_before_anything_is_made(
     assert "pretraining seed" not in printed
 
 
-@pytest.mark.long
 def test_a_policy_ships_from_a_checkout_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -50,7 +50,6 @@ def test_a_record_of_a_newer_clbench_is_unreadable_and_not_damaged(
     assert "2 runs: 1 done, 1 unreadable." in shown
 
 
-@pytest.mark.long
 def test_it_counts_the_runs_of_a_request_by_their_states(
     records: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

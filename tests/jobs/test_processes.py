@@ -94,7 +94,6 @@ def _is_gone(process: int) -> bool:
     return False
 
 
-@pytest.mark.long
 def test_the_children_of_a_job_end_with_it(tmp_path: Path, bars: Bars) -> None:
     path = tmp_path / "child"
     assert run_jobs([_job("leaves_a_child", path=str(path))], Processes(1), bars) == {}

@@ -32,7 +32,6 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.long
 def test_an_agent_has_its_own_division_and_takes_no_part_in_others(board: Path) -> None:
     table = load(board / "records").set_index("method")
     assert dict(table["division"]) == {"sft": "prior-data-free", "me/knows": "online"}

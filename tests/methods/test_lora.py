@@ -55,7 +55,6 @@ def _adapted(variant: str, **changes: Any) -> tuple[Any, Policy]:
     return method, policy
 
 
-@pytest.mark.long
 @VARIANTS
 def test_adapters_begin_as_no_change_and_sit_on_every_linear_map_of_the_layers(variant: str) -> None:
     policy, batch = TransformerPolicy(SMALL), toy_source("right", seed=1).sample(8)

@@ -48,7 +48,6 @@ def _value(scores: dict[str, Scores], method: str, metric: str) -> float:
     return value
 
 
-@pytest.mark.long
 def test_sft_learns_the_targets_and_forgets_the_skills(scores: dict[str, Scores]) -> None:
     assert _value(scores, "sft", "adaptation") >= 0.9
     assert _value(scores, "sft", "retention") <= 0.2

@@ -36,7 +36,6 @@ subject = importlib.import_module("clbench.leaderboard.submission.subject")
 tiers = importlib.import_module("clbench.leaderboard.board.tiers")
 
 
-@pytest.mark.long
 def test_a_stage_ends_at_the_first_check_that_meets_the_criterion(record: Record) -> None:
     assert record.status == "success", record.error
     planned = check_steps(200)

@@ -213,7 +213,6 @@ def test_a_world_that_does_not_repeat_an_episode_is_refused_and_all_worlds_are_c
     assert Unsteady.still_open == 0
 
 
-@pytest.mark.long
 def test_the_command_writes_the_requested_film(recorded: tuple[Record, Path], tmp_path: Path) -> None:
     path = tmp_path / "toy.gif"
     film(

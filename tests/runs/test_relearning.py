@@ -50,7 +50,6 @@ def velocity(policy: Policy, batch: Batch) -> torch.Tensor:
         return policy.predict(batch)
 
 
-@pytest.mark.long
 @pytest.mark.usefixtures("one_thread")
 def test_the_shift_is_the_mean_squared_change_of_velocity_on_the_new_targets_data(
     record: Record, policies: list[Policy], data: TrainingData

@@ -93,7 +93,6 @@ def _assert_equal(first: list[Policy], second: list[Policy]) -> None:
         assert all(value.equal(other[name]) for name, value in one.items())
 
 
-@pytest.mark.long
 def test_a_run_keeps_a_folder_for_each_stage(kept: Path) -> None:
     files = {"policy.safetensors", "policy.json", "method.safetensors", "method.json", "clbench.json"}
     folders = sorted((kept / "me--Tiny-v0" / "lora" / "seed-0").iterdir())
