@@ -1,16 +1,30 @@
 """The hand-written documents: their links, and the versions that several files repeat."""
 
 import re
+import shlex
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from helpers import blocks_of
+
+from clbench.cli.main import app
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted(
     [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")], key=lambda path: path.relative_to(ROOT).as_posix()
 )
+
+COMMANDS = [
+    line.removeprefix("$ ")
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs" / "guide").glob("*.md")))
+    for language in ("console", "shell")
+    for block in blocks_of(page, language)
+    for line in block.replace("\\\n", " ").splitlines()
+    if line.removeprefix("$ ").startswith("clbench ")
+]
+"""Commands that the README and the guides show."""
 
 
 def _links(text: str) -> Iterator[str]:
@@ -37,6 +51,11 @@ def test_every_link_of_a_document_leads_to_a_file_and_a_heading(page: Path) -> N
         if not there:
             broken.append(link)
     assert broken == []
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_that_a_guide_shows_is_taken_by_the_command_line(command: str) -> None:
+    app.parse_args(shlex.split(command, comments=True)[1:], exit_on_error=False, print_error=False)
 
 
 def _text(name: str) -> str:

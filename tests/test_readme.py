@@ -113,10 +113,3 @@ def test_the_readme_states_how_many_claims_there_are_and_how_many_are_decided() 
         f"judge {len(claims)} statements of papers; {len(decided)} of them are decided on at least one board"
     )
     assert stated in text
-
-
-def test_every_command_and_file_that_the_readme_names_exists() -> None:
-    text = README.read_text(encoding="utf-8")
-    for path in re.findall(r"\]\(([\w./-]+)\)", text):
-        if not path.startswith("leaderboard/"):  # records and site are not part of an installed package
-            assert (README.parent / path).exists(), path
