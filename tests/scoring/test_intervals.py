@@ -245,13 +245,16 @@ def test_the_interval_of_pooled_curves_is_the_jackknifes() -> None:
 
 def test_intervals_stay_in_the_range_of_their_metric_and_hold_their_value() -> None:
     generator, shape = np.random.default_rng(0), layout(2, 3, targets=2, held_out=1, points=2)
+    seen = set()
     for seeds in (1, 2, 3):
         for _ in range(5):
-            runs = {seed: random_run(generator, shape) for seed in range(seeds)}
-            references = dict.fromkeys(("from_scratch", "joint", "sft"), runs)
+            runs, others = ({seed: random_run(generator, shape) for seed in range(seeds)} for _ in range(2))
+            references = dict.fromkeys(("from_scratch", "joint", "sft"), others)
             for name, one in estimate(METRICS, runs, generator, references=references, replicates=50).items():
                 if one.value is not None and one.low is not None and one.high is not None:
                     assert METRICS[name].low <= one.low <= one.value <= one.high <= METRICS[name].high
+                    seen.add(name)
+    assert seen == METRICS.keys()
 
 
 def test_seeds_that_agree_exactly_have_the_error_of_episodes_and_the_quantile_of_seeds() -> None:
