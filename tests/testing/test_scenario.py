@@ -4,9 +4,11 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 
 from clbench.base.errors import InputError, UnknownNameError
 from clbench.data.questions import QuestionKind
@@ -269,8 +271,13 @@ def test_a_check_needs_episodes() -> None:
         check_scenario(TOY, episodes=0)
 
 
-def test_a_scenario_may_be_named_by_its_id() -> None:
-    with pytest.raises(InputError, match="episodes must be a whole number from 1, not 0"):
-        check_scenario("clbench.testing:clbench/Toy-v0", episodes=0)
+AIMLESS = dataclasses.replace(TOY, id="me/Aimless-v0", target=())
+
+
+def test_a_scenario_may_be_named_by_its_id(monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = EnvSpec(AIMLESS.id, kwargs={"scenario": f"{HERE}AIMLESS"})
+    monkeypatch.setitem(gymnasium.registry, AIMLESS.id, spec)
+    with pytest.raises(ScenarioError, match="me/Aimless-v0: there is no target to learn"):
+        check_scenario(AIMLESS.id)
     with pytest.raises(UnknownNameError, match="Did you mean 'clbench/Fetch-v1'"):
         check_scenario("clbench/fetch-v1")
