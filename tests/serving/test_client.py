@@ -41,6 +41,14 @@ def answering(handle: Callable[[ServerConnection], None]) -> Iterator[str]:
             thread.join()
 
 
+def until(happened: Callable[[], bool]) -> None:
+    """Wait until something has happened, for a minute at most."""
+    deadline = time.monotonic() + 60
+    while not happened():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
 def test_a_served_policy_acts_like_the_same_policy_here(tmp_path: Path) -> None:
     here = write_policy(tmp_path)(0)
     with serving(tmp_path, 0) as (address, _):
@@ -66,7 +74,7 @@ def test_a_server_that_is_killed_and_started_again_is_found_again(
     found: list[Any] = []
     thread = threading.Thread(target=lambda: found.append(served(OBSERVATIONS)))
     thread.start()
-    time.sleep(0.5)
+    until(lambda: "Waiting for the policy at" in caplog.text)
     with serving(tmp_path, 0, port):
         thread.join()
     assert np.array_equal(found[0], expected)
@@ -111,9 +119,8 @@ def test_a_server_that_is_still_loading_is_waited_for_with_a_message_now_and_the
     found: list[ServedPolicy] = []
     thread = threading.Thread(target=lambda: found.append(ServedPolicy(address)))
     thread.start()
-    time.sleep(1.0)
+    until(lambda: len(caplog.messages) >= 2)
     assert f"Waiting for the policy at {address}, for 0 of 600 seconds: " in caplog.messages[0]
-    assert len(caplog.messages) >= 2
     with serving(tmp_path, 0, port):
         thread.join()
     found[0].close()
