@@ -30,9 +30,11 @@ from clbench.worlds.threads import cores
 SEND_SECONDS = 0.2
 """Least time between two progress reports of a worker, in seconds."""
 
+LEAVE_SECONDS = 5.0
+"""Time for a process that has sent its outcome to end, in seconds; then it is killed."""
+CLOSE_SECONDS = 3.0
+"""Time for processes to end after SIGTERM, in seconds; then they are killed."""
 _LOOK_SECONDS = 0.5
-_LEAVE_SECONDS = 5.0
-_CLOSE_SECONDS = 3.0
 
 
 def at_once(device: str) -> int:
@@ -119,7 +121,7 @@ class Processes:
         try:
             for process in processes:
                 process.terminate()
-            deadline = time.monotonic() + _CLOSE_SECONDS
+            deadline = time.monotonic() + CLOSE_SECONDS
             for process in processes:
                 process.join(max(0.0, deadline - time.monotonic()))
         finally:  # a second signal may interrupt the wait
@@ -214,7 +216,7 @@ def _handles_suspension() -> bool:
 
 def _leave(process: BaseProcess) -> None:
     """Wait until a process that has sent its outcome is gone, and kill what still runs of all it began."""
-    process.join(_LEAVE_SECONDS)
+    process.join(LEAVE_SECONDS)
     _end(process)
 
 

@@ -117,7 +117,7 @@ def test_a_job_that_a_signal_ends_is_lost_with_its_name_or_number(number: int, n
 def test_closing_ends_a_job_that_ignores_it_and_its_children(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("clbench.jobs.processes._CLOSE_SECONDS", 0.2)
+    monkeypatch.setattr("clbench.jobs.processes.CLOSE_SECONDS", 0.2)
     path, workers = tmp_path / "pids", Processes(1)
     workers.start(_job("stubborn", path=str(path)))
     while not (path.exists() and path.read_text()):

@@ -184,7 +184,7 @@ def test_a_job_whose_work_another_process_took_over_is_done_later(tmp_path: Path
 def test_a_job_that_leaves_a_thread_behind_ends_with_its_result(
     bars: Bars, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("clbench.jobs.processes._LEAVE_SECONDS", 0.2)
+    monkeypatch.setattr("clbench.jobs.processes.LEAVE_SECONDS", 0.2)
     begin = time.monotonic()
     assert run_jobs([_job("loose", "leaves_a_thread"), _job("next", "good")], Processes(1), bars) == {}
     assert time.monotonic() - begin < 500
