@@ -10,7 +10,7 @@ from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="package")
 def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with the record of one run, and the policies that it kept."""
     folder = tmp_path_factory.mktemp("honest")

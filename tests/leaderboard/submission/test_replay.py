@@ -186,3 +186,30 @@ def test_a_step_that_is_said_to_be_much_cheaper_leaves_the_tier_open(tmp_path: P
     edit(path, lambda values: values["timing"].update(step_ratio=0.05))
     assert "time of a step: 0.05 times that of sft in the record" in failures(verify(path, "retrained"))
     assert tiers.tier_of(path) == "replayed"
+
+
+@pytest.mark.long
+def test_a_record_can_be_replayed_from_policies_that_are_made_again(mine: Path) -> None:
+    checks = verify(mine, "replayed", episodes=20)
+    assert failures(checks) == ""
+    assert any(check.found.startswith("20 of ") for check in checks)
+    assert any(check.found == "trained again" for check in checks)
+
+
+def test_the_worlds_are_closed_if_a_replay_fails(
+    mine: Path, honest: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed = []
+
+    class Broken(Evaluator):
+        def play(self, *arguments: Any, **options: Any) -> Any:
+            raise RuntimeError("the simulator crashed")
+
+        def close(self) -> None:
+            closed.append(self)
+            super().close()
+
+    monkeypatch.setattr("clbench.leaderboard.submission.replay.Evaluator", Broken)
+    with pytest.raises(RuntimeError, match="the simulator crashed"):
+        verify(mine, "replayed", honest)
+    assert len(closed) == 1
