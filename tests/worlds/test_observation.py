@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
-from helpers import build_method
+from helpers import blocks_of, build_method
 from numpy.typing import NDArray
 
 from clbench.base.cache import cache_folder
@@ -26,12 +26,13 @@ from clbench.policy.transformer import TransformerPolicy
 from clbench.spec.registry import load_scenario
 from clbench.testing.seen_toy import SEEN_TOY
 from clbench.testing.toy_camera import ToyCamera
-from clbench.worlds.camera import VIEW_SIZE
+from clbench.worlds.camera import VIEW_SIZE, load_camera
 from clbench.worlds.gl_backend import RenderingError
 from clbench.worlds.lanes import Lanes
 from clbench.worlds.observation import TOGETHER, Observer, frame_hash, observed
 from clbench.worlds.perturbation import draw_perturbation
 
+PAGE = Path(__file__).parents[2] / "docs" / "guide" / "pixels.md"
 TOY = load_scenario("clbench.testing:clbench/Toy-v0")
 TASK = SEEN_TOY.retained[0]
 SHORT = dataclasses.replace(
@@ -60,6 +61,16 @@ def test_a_camera_that_lacks_something_is_refused_by_name() -> None:
         TypeError, match=r"ToyWorld is no camera: it lacks .*pictured.* docs/guide/pixels\.md shows"
     ):
         Observer(TASK.world, "clbench.testing.toy:ToyWorld")
+
+
+def test_the_camera_that_the_guide_shows_is_one(write_module: Callable[[str, str], None]) -> None:
+    (shown,) = blocks_of(PAGE, "python")
+    write_module("camera_of_the_guide", shown)
+    camera = load_camera("camera_of_the_guide:MyCamera")
+    states = np.zeros((3, 10), np.float32)
+    assert camera.image_size == 64
+    assert camera.proprioception(states).shape == (3, camera.state_size) == (3, 4)
+    assert camera.pictured(states).shape == (3, 6)
 
 
 @pytest.fixture
