@@ -16,7 +16,7 @@ from clbench.records.reader import read_record
 from clbench.records.record import Costs
 from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
-from clbench.worlds.scenario_env import Observation, ScenarioEnv
+from clbench.worlds.scenario_env import Observation
 from clbench.worlds.scenario_vector_env import ScenarioVectorEnv
 
 
@@ -361,18 +361,3 @@ def test_an_environment_without_a_scenario_or_a_stage_is_refused(evaluate: Calla
             evaluate(Knowing(), env)
     with pytest.raises(ValueError, match=r"goes through all stages: .*'clbench/Toy-v0', stage=0\)"):
         evaluate(Knowing(), gymnasium.make(ID))
-
-
-@pytest.mark.parametrize("stage", [-1, 3, "1"])
-def test_an_environment_of_a_missing_stage_is_refused(stage: Any) -> None:
-    with pytest.raises(ValueError, match=f"clbench/Toy-v0 has stages 0 to 2, not {stage!r}"):
-        ScenarioEnv(TOY, stage=stage)
-
-
-def test_an_environment_of_a_stage_never_leaves_it() -> None:
-    env = ScenarioEnv(TOY, stage=0, episodes_per_stage=1)
-    assert [env.reset()[1]["task"] for _ in range(4)] == ["left", "up", "left", "up"]
-    with pytest.raises(ValueError, match="stays in stage 0: make another for stage 1"):
-        env.reset(options={"stage": 1})
-    env = ScenarioEnv(TOY, stage=2)
-    assert env.reset(seed=0)[1]["task"] == env.reset()[1]["task"] == "down"

@@ -23,7 +23,6 @@ from clbench.runs.spec import RunSpec
 from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
 from clbench.spec.registry import load_scenario
-from clbench.worlds.scenario_env import ScenarioEnv
 from clbench.worlds.scenario_vector_env import ScenarioVectorEnv
 
 TOY = load_scenario("clbench.testing:clbench/Toy-v0")
@@ -62,14 +61,7 @@ def run(method: str, folder: Path, **changes: int) -> Record:
     return execute(RunSpec(SCENARIO.id, method, 0, changes), folder)
 
 
-def test_the_schedule_begins_with_the_first_target() -> None:
-    env = ScenarioEnv(SCENARIO, episodes_per_stage=2)
-    schedule = [env.reset()[1] for _ in range(5)]
-    assert [info["stage"] for info in schedule] == [1, 1, 2, 2, 2]
-    assert [info["task"] for info in schedule] == ["right", "right", "down", "down", "down"]
-    assert env.reset(options={"stage": 1})[1]["task"] == "right"
-    with pytest.raises(ValueError, match="has stages 1 to 2, not 0"):
-        env.reset(options={"stage": 0})
+def test_the_schedule_of_many_environments_begins_with_the_first_target() -> None:
     many = ScenarioVectorEnv(SCENARIO, num_envs=2, episodes_per_stage=2)
     assert many.reset(seed=0)[1]["task"].tolist() == ["right", "right"]
     many.close()

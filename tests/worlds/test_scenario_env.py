@@ -57,6 +57,15 @@ def test_an_environment_of_one_stage_never_leaves_it(stage: int, tasks: list[str
     env = _toy(stage=stage, episodes_per_stage=1)
     schedule = [env.reset()[1] for _ in range(4)]
     assert [(info["stage"], info["task"]) for info in schedule] == [(stage, task) for task in tasks]
+    other = (stage + 1) % 3
+    with pytest.raises(ValueError, match=f"stays in stage {stage}: make another for stage {other}"):
+        env.reset(options={"stage": other})
+
+
+@pytest.mark.parametrize("stage", [-1, 3, "1"])
+def test_an_environment_of_a_missing_stage_is_refused(stage: Any) -> None:
+    with pytest.raises(ValueError, match=f"clbench/Toy-v0 has stages 0 to 2, not {stage!r}"):
+        _toy(stage=stage)
 
 
 def test_a_chosen_task_has_the_stage_that_trains_it_and_is_no_episode_of_the_schedule() -> None:
@@ -259,7 +268,7 @@ def test_an_environment_of_one_task_never_leaves_it(task: str, stage: int) -> No
     assert [(info["task"], info["stage"]) for info in infos] == [(task, stage)] * 4
     many = gymnasium.make_vec("clbench.testing:clbench/Toy-v0", num_envs=2, task=task, episodes_per_stage=1)
     many.reset(seed=0)
-    for _ in range(100):  # episodes end after 20 steps
+    for _ in range(100):  # episodes end after 12 steps
         *_, info = many.step(np.zeros((2, 2), np.float32))
         assert list(info["task"]) == [task] * 2
 
