@@ -79,8 +79,8 @@ def from_matrix(
             shares unless one is above 1; `Report.unit` says what was assumed.
 
     Raises:
-        InputError: The shape does not fit the tasks, a rate is no number or out of range, there is no such
-            unit, or the rates leave in doubt which it is.
+        InputError: A shape does not fit the tasks or the other methods, a rate is no number or out of range,
+            there is no such unit, or the rates leave in doubt which it is.
         UnknownNameError: There is no such task.
     """
     given = matrix if isinstance(matrix, Mapping) else {"": matrix}

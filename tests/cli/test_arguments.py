@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from clbench.base.errors import InputError
-from clbench.cli.arguments import checked_input, checked_writing
+from clbench.cli.arguments import add_cwd_to_path, checked_input, checked_writing
 from clbench.cli.main import app
 
 
@@ -16,6 +16,18 @@ def test_a_file_that_does_not_fit_on_the_disk_is_named() -> None:
         checked_writing(full),
     ):
         full.write_text("a film")
+
+
+def test_a_working_directory_that_is_gone_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    with pytest.raises(SystemExit, match="2"):
+        add_cwd_to_path()
+    assert "error: The working directory no longer exists: change to another one." in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("words", [["--records=~/somewhere"], ["--records", "~/somewhere"]])

@@ -356,6 +356,11 @@ def test_a_wrong_matrix_is_refused_with_what_was_expected(arguments: dict[str, o
         from_matrix(**arguments)  # type: ignore[arg-type]
 
 
+def test_matrices_of_other_stages_or_tasks_are_refused_with_their_shapes() -> None:
+    with pytest.raises(InputError, match=r"the same stages and tasks; .* 'a' \(3, 2\), 'b' \(2, 2\)"):
+        from_matrix({"a": np.full((3, 2), 0.5), "b": np.full((2, 2), 0.5)})
+
+
 def test_an_unknown_task_metric_or_method_is_refused_with_the_nearest_name() -> None:
     with pytest.raises(UnknownNameError, match="Did you mean 'sft'"):
         from_matrix({"sft": TRIANGLE}).of("adaptation", "stf")

@@ -223,6 +223,16 @@ def test_the_command_writes_the_requested_film(recorded: tuple[Record, Path], tm
         assert gif.info["duration"] == 100  # ten steps in a second, as the world says
 
 
+def test_a_film_does_not_take_the_place_of_a_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "toy.gif"
+    folder.mkdir()
+    with pytest.raises(SystemExit, match="2"):
+        film(TOY, "sft", output=folder)
+    assert f"--output {folder} is a folder: name a file." in capsys.readouterr().err
+
+
 @pytest.mark.slow  # 5 s
 def test_a_film_of_several_methods_shows_each_after_the_last_target(
     recorded: tuple[Record, Path], tmp_path: Path, written: list[str]

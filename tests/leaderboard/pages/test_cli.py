@@ -7,8 +7,9 @@ import pytest
 from clbench.base.entry_points import resolve
 
 TOY = "clbench/Toy-v0"
-claims, findings, method_pages = (
-    resolve(f"clbench.leaderboard.pages.cli:{name}") for name in ("claims", "findings", "method_pages")
+claims, findings, method_pages, scenario_card = (
+    resolve(f"clbench.leaderboard.pages.cli:{name}")
+    for name in ("claims", "findings", "method_pages", "scenario_card")
 )
 
 
@@ -30,3 +31,11 @@ def test_a_page_that_cannot_be_written_is_named_in_one_line(
         command(records=four_methods, controls=tmp_path, output=tmp_path / "file" / "page.md")
     assert ended.value.code == 2
     assert f"error: {tmp_path / 'file' / 'page.md'}" in capsys.readouterr().err
+
+
+def test_without_records_the_command_for_cards_asks_for_a_scenario(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        scenario_card(records=tmp_path, output=tmp_path / "cards")
+    assert f"No scenario has records in {tmp_path}. Name one, for example " in capsys.readouterr().err
