@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -126,7 +126,6 @@ def collect(task: Task, budget: Budget) -> list[Demonstration]:
         InputError: The expert fails more often than it succeeds.
         LeakError: The running hooks of a method must not read them.
     """
-    check_demonstrations(task.name)
     with contextlib.closing(_world(task)) as world:
         return _collect(world, task, budget, no_progress)
 
@@ -188,21 +187,33 @@ def dataset_folder(task: Task, budget: Budget, progress: ProgressCallback = no_p
         InputError: The expert fails more often than it succeeds.
         LeakError: The running hooks of a method must not read them.
     """
+    check_demonstrations(task.name)
+    return keep_dataset(task, budget, lambda world: _collect(world, task, budget, progress))
+
+
+def keep_dataset(task: Task, budget: Budget, episodes: Callable[[World], Sequence[Demonstration]]) -> Path:
+    """Return the folder of the task's Minari dataset, which holds what `episodes` returned.
+
+    Args:
+        task: Task of the demonstrations.
+        budget: Budget with the number of demonstrations.
+        episodes: Returns the episodes, given an environment of the task's world. It is called only if there
+            is no such dataset yet.
+    """
     from minari.storage.datasets_root_dir import get_dataset_path
 
-    check_demonstrations(task.name)
     name = dataset_id(task, budget)
     folder = get_dataset_path(name)
-    declare_namespaces(folder, name)
+    _declare_namespaces(folder, name)
 
     def make(partial: Path) -> None:
         with contextlib.closing(_world(task)) as world:
-            write_dataset(partial / "data", name, task, world, _collect(world, task, budget, progress))
+            _write_dataset(partial / "data", name, task, world, episodes(world))
 
     return cached(folder, dataset_inputs(task, budget), make)
 
 
-def declare_namespaces(folder: Path, dataset_id: str) -> None:
+def _declare_namespaces(folder: Path, dataset_id: str) -> None:
     """Write the namespace files that Minari's own listing looks for."""
     parts = dataset_id.split("/")[:-1]
     for depth in range(1, len(parts) + 1):
@@ -216,7 +227,7 @@ def declare_namespaces(folder: Path, dataset_id: str) -> None:
                 )
 
 
-def write_dataset(
+def _write_dataset(
     folder: Path, name: str, task: Task, world: World, episodes: Sequence[Demonstration]
 ) -> None:
     """Write episodes as a Minari dataset: the executed actions as actions, the expert's among the infos."""

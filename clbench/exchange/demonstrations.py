@@ -6,15 +6,13 @@ import logging
 import os
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 
-from clbench.base.cache import cached
 from clbench.base.dependencies import require
-from clbench.base.entry_points import resolve, unknown
+from clbench.base.entry_points import unknown
 from clbench.base.errors import InputError
 from clbench.base.leftovers import unfinished
 from clbench.base.text import counted
@@ -23,10 +21,8 @@ from clbench.data.demonstrations import (
     Demonstration,
     dataset_folder,
     dataset_id,
-    dataset_inputs,
-    declare_namespaces,
+    keep_dataset,
     read_dataset,
-    write_dataset,
 )
 from clbench.evaluation.definition import recording_of
 from clbench.exchange.recorded import expert_of, recording_hash
@@ -190,8 +186,6 @@ def import_demonstrations(
             demonstrations, or the budget of the scenario has another number of them.
         UnknownNameError: There is no such scenario or task.
     """
-    from minari.storage.datasets_root_dir import get_dataset_path
-
     from clbench.exchange.hdf5 import read_hdf5
 
     loaded, (chosen,) = chosen_tasks(scenario, [task])
@@ -202,16 +196,8 @@ def import_demonstrations(
             f"{path} has {counted(len(episodes), 'demonstration')}, but the budget of {loaded.id} has "
             f"{loaded.budget.demonstrations}: both must agree, because records show the budget."
         )
-    name = dataset_id(chosen, loaded.budget)
-    folder = get_dataset_path(name)
-    declare_namespaces(folder, name)
-
-    def make(partial: Path) -> None:
-        with closing(resolve(chosen.world)()) as world:
-            write_dataset(partial / "data", name, chosen, world, episodes)
-
-    cached(folder, dataset_inputs(chosen, loaded.budget), make)
-    return name
+    keep_dataset(chosen, loaded.budget, lambda _: episodes)
+    return dataset_id(chosen, loaded.budget)
 
 
 def _check_owner(scenario: Scenario, task: Task, found: str, path: Path) -> None:
