@@ -17,14 +17,13 @@ from clbench.base.cache import MANIFEST, cache_folder, cached, hash_of, is_cache
 from clbench.base.errors import WrongTypeError
 from clbench.base.lease import Lease
 from clbench.base.progress import ProgressCallback, announce, no_progress
-from clbench.data.training_data import TrainingData
 from clbench.evaluation.checks import Checker
 from clbench.evaluation.examiner import Examiner
 from clbench.learning.adaptation import Step
 from clbench.learning.hooks import place_of
 from clbench.learning.method import MethodState
 from clbench.learning.optimise import deterministic
-from clbench.learning.pretraining import pretrained_policy
+from clbench.learning.pretraining import pretrained_folder
 from clbench.learning.registry import describe_method
 from clbench.learning.trainer import Trainer, training_inputs
 from clbench.records.paths import stage_folder
@@ -105,7 +104,7 @@ def pretrained_hash(folder: Path) -> str:
     return str(manifest["files"]["policy.safetensors"][:16])
 
 
-def _new_record(run: ResolvedRun, trainer: Trainer, pretrained_folder: Path) -> Record:
+def _new_record(run: ResolvedRun, trainer: Trainer) -> Record:
     """Return the record of a run that has not begun."""
     return Record(
         status="success",
@@ -117,7 +116,7 @@ def _new_record(run: ResolvedRun, trainer: Trainer, pretrained_folder: Path) -> 
             **fingerprint(run.published, run.spec.device),
             "method": describe_method(run.method),
             "policy": policy_source(run.spec.policy),
-            "pretrained": pretrained_hash(pretrained_folder),
+            "pretrained": pretrained_hash(pretrained_folder(run.scenario, run.spec.seed)),
         },
         timing={"stages": []},
     )
@@ -182,12 +181,9 @@ class _Run:
     ) -> _Run:
         """Return a run with all its parts; the policy is pretrained, and data collected, on first use."""
         scenario, spec = run.scenario, run.spec
-        pretrained, folder = pretrained_policy(scenario, spec.seed)
-        pretrained = pretrained.to(spec.device)
-        data = TrainingData.open(scenario, pretrained.config)
-        trainer = Trainer(scenario, data, pretrained, run.new_method, spec.seed)
-        record = _new_record(run, trainer, folder)
-        examiner = Examiner(scenario, run.protocol, data, pretrained, spec.seed, progress)
+        trainer = Trainer.open(scenario, run.new_method, spec.seed, spec.device)
+        record = _new_record(run, trainer)
+        examiner = Examiner(scenario, run.protocol, trainer.data, trainer.pretrained, spec.seed, progress)
         checker = Checker(scenario, run.protocol, spec.seed)
         return cls(
             run=run,
