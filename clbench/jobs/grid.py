@@ -23,6 +23,7 @@ from clbench.jobs.scheduler import run_with_bars
 from clbench.records.paths import RECORDS
 from clbench.records.reader import read_record
 from clbench.runs.spec import ResolvedRun, RunSpec, check_device
+from clbench.spec.fields import whole_number
 from clbench.spec.identifiers import check_known, installed_methods
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.protocol import DEFAULT_SEEDS, MOST_SEEDS
@@ -225,9 +226,8 @@ def run_specs(firsts: Sequence[RunSpec], seeds: int, records: Path, workers: int
             scenario or the policy.
         RunsFailedError: A run failed.
     """
-    for name, value in (("seeds", seeds), ("workers", workers)):
-        if value is not None and (type(value) is not int or value < 1):
-            raise InputError(f"{name} must be a whole number from 1, not {value!r}.")
+    whole_number("seeds", seeds, 1)
+    whole_number("workers", workers, 1)
     if seeds > MOST_SEEDS:
         raise InputError(f"seeds must be at most {MOST_SEEDS:,}, not {seeds}.")
     check_known([one.scenario for one in firsts], [one.method for one in firsts])
@@ -239,19 +239,24 @@ def run_specs(firsts: Sequence[RunSpec], seeds: int, records: Path, workers: int
     specs = [replace(one, seed=one.seed + number) for one in firsts for number in range(seeds)]
     runs = [spec.resolve() for spec in specs]
     console = lines_console()
-    typed = [run for run in runs if run.spec.method.startswith("__main__:")]
-    others = [run for run in runs if not run.spec.method.startswith("__main__:")]
-    if not all(has_record(run, records) for run in runs):
+    to_do = missing(runs, records, None).runs
+    if to_do:
         check_folders({"records": records})
     # other processes cannot import the class, but can make what its runs need
-    needed = missing(typed, records, None).plan(records, None).inputs
+    needed = Missing([run for run in to_do if _is_typed(run)], []).plan(records, None).inputs
     failed = run_with_bars(needed, Processes(workers), console) if needed else {}
+    typed, others = [run for run in runs if _is_typed(run)], [run for run in runs if not _is_typed(run)]
     device = firsts[0].device
     failed |= run_missing(others, records, lambda: Processes(workers, device), console) if others else {}
     failed |= run_missing(typed, records, Here, console) if typed else {}
     if failed:
         raise RunsFailedError("\n".join(f"{job}: {reason}" for job, reason in failed.items()))
     return [read_record(run.path(records)) for run in runs]
+
+
+def _is_typed(run: ResolvedRun) -> bool:
+    """Return whether the method of a run is a class of this notebook or script."""
+    return run.spec.method.startswith("__main__:")
 
 
 def name_of(method: str | type[Method]) -> str:

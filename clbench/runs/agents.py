@@ -38,11 +38,11 @@ from clbench.records.record import ONLINE_USES, AnswerRow, Record, RunInfo
 from clbench.records.writer import write_record
 from clbench.runs.fingerprint import fingerprint
 from clbench.runs.spec import describe_scenario
+from clbench.spec.fields import is_whole, whole_number
 from clbench.spec.identifiers import built_in_methods, check_method_name
 from clbench.spec.protocol import FIRST_TUNING_SEED, LARGEST_SEED, Protocol, ScoredSplit
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
-from clbench.worlds.schedule import is_whole, whole_number
 
 LOG = logging.getLogger("clbench")
 

@@ -24,8 +24,8 @@ from clbench.records.paths import RECORDS
 from clbench.records.reader import RecordError, read_record
 from clbench.records.record import EXTERNAL_USES, Record
 from clbench.runs.agents import UNFINISHED, StagedRun
+from clbench.spec.fields import is_whole, whole_number
 from clbench.spec.registry import load_scenario
-from clbench.worlds.schedule import is_whole, whole_number
 
 LOG = logging.getLogger("clbench")
 

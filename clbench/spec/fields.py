@@ -1,12 +1,33 @@
-"""Checks of the fields of a dataclass, so that a wrong value is named where it is written."""
+"""Checks of values, most of them fields of a dataclass, so that a wrong one is named where it is written."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
+
+import numpy as np
 
 from clbench.base.entry_points import is_entry_point
 from clbench.base.errors import InputError, WrongTypeError
 from clbench.base.text import quoted
+
+
+def is_whole(value: Any) -> bool:
+    """Return whether a value is a whole number, of Python or of NumPy; True and 1.0 are none."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+
+
+def whole_number(name: str, value: int | None, least: int) -> int | None:
+    """Return a whole number, of Python or of NumPy, as Python's, which JSON can hold; None stays None.
+
+    Raises:
+        InputError: It is no whole number, or below `least`.
+    """
+    if value is None:
+        return None
+    if not is_whole(value) or value < least:
+        raise InputError(f"{name} must be a whole number from {least}, not {value!r}.")
+    return int(value)
 
 
 def check_whole(part: object, least: int, *fields: str, most: int | None = None) -> None:

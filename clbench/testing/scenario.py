@@ -19,11 +19,11 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from clbench.base.entry_points import resolve
-from clbench.base.errors import InputError
 from clbench.base.seeding import derive_seed
 from clbench.data.demonstrations import demonstrate
 from clbench.data.questions import QuestionKind
 from clbench.evaluation.definition import recording_of
+from clbench.spec.fields import whole_number
 from clbench.spec.identifiers import check_plain, check_scenario_id
 from clbench.spec.language import LENGTHS, fitting_length, word_id, word_ids
 from clbench.spec.registry import load_scenario
@@ -58,14 +58,13 @@ def check_scenario(scenario: Scenario | str, *, episodes: int = 10, success: flo
         success: Share of the episodes in which the expert must succeed.
 
     Raises:
-        InputError: There are no episodes.
+        InputError: The number of episodes is no whole number from 1.
         UnknownNameError: An entry point does not exist.
         ScenarioError: Any other part is wrong.
     """
     if isinstance(scenario, str):
         scenario = load_scenario(scenario)
-    if episodes < 1:
-        raise InputError(f"episodes must be a whole number from 1, not {episodes}.")
+    whole_number("episodes", episodes, 1)
     tasks = scenario.tasks + scenario.background
     try:
         check_scenario_id(scenario.id)

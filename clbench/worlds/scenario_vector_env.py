@@ -16,12 +16,13 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from clbench.base.errors import InputError, WrongTypeError
+from clbench.spec.fields import is_whole
 from clbench.spec.registry import opened_scenario
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 from clbench.worlds.lanes import Lanes
 from clbench.worlds.scenario_env import Observation
-from clbench.worlds.schedule import InstructionFormat, Schedule, Start, is_whole
+from clbench.worlds.schedule import InstructionFormat, Schedule, Start
 from clbench.worlds.threads import cores
 
 Flags = NDArray[np.bool_]

@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from clbench.base.errors import InputError
+from clbench.spec.fields import is_whole
 from clbench.spec.language import VOCABULARY_SIZE, word_ids
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
@@ -134,24 +135,6 @@ class Schedule:
         if self._stage not in (None, stage) or self._task is not None:
             home = f"in stage {self._stage}" if self._task is None else f"with the task {self._task!r}"
             raise InputError(f"This environment stays {home}: make another for stage {stage}.")
-
-
-def is_whole(value: Any) -> bool:
-    """Return whether a value is a whole number, of Python or of NumPy; True and 1.0 are none."""
-    return isinstance(value, int | np.integer) and not isinstance(value, bool)
-
-
-def whole_number(name: str, value: int | None, least: int) -> int | None:
-    """Return a whole number, of Python or of NumPy, as Python's, which JSON can hold; None stays None.
-
-    Raises:
-        InputError: It is no whole number, or below `least`.
-    """
-    if value is None:
-        return None
-    if not is_whole(value) or value < least:
-        raise InputError(f"{name} must be a whole number from {least}, not {value!r}.")
-    return int(value)
 
 
 def shown_instruction(words: str, form: InstructionFormat, scenario: Scenario) -> Any:

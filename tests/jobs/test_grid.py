@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -196,6 +197,7 @@ def test_policies_that_another_command_has_made_again_meanwhile_are_not_made_twi
         ({"seeds": 1.5}, "seeds must be a whole number from 1, not 1.5"),
         ({"seeds": 0}, "seeds must be a whole number from 1, not 0"),
         ({"seeds": 10_001}, "seeds must be at most 10,000, not 10001"),
+        ({"seeds": np.int64(10_001)}, "seeds must be at most 10,000, not 10001"),
         (
             {"first_seed": 2**64},
             "RunSpec.seed must be at most 18446744073709551615, not 18446744073709551616",

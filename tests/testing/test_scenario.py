@@ -266,9 +266,10 @@ def test_a_scenario_without_a_target_is_named() -> None:
         check_scenario(dataclasses.replace(TOY, target=()))
 
 
-def test_a_check_needs_episodes() -> None:
-    with pytest.raises(InputError, match="episodes must be a whole number from 1, not 0"):
-        check_scenario(TOY, episodes=0)
+@pytest.mark.parametrize("episodes", [0, 2.5])
+def test_a_check_needs_a_whole_number_of_episodes(episodes: Any) -> None:
+    with pytest.raises(InputError, match=f"episodes must be a whole number from 1, not {episodes}"):
+        check_scenario(TOY, episodes=episodes)
 
 
 AIMLESS = dataclasses.replace(TOY, id="me/Aimless-v0", target=())
