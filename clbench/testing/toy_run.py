@@ -9,7 +9,7 @@ import itertools
 import json
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +55,7 @@ _numbers = itertools.count()
 
 
 @functools.cache
-def toy_data(policy: str = DEFAULT_POLICY) -> tuple[TrainingData, Policy]:
+def toy_data(policy: str) -> tuple[TrainingData, Policy]:
     """Return the data and a pretrained policy of the toy; reading them takes a second."""
     pretrained, _ = pretrained_policy(TOY.with_policy(policy), 0)
     return TrainingData.open(TOY, pretrained.config), pretrained
@@ -70,12 +70,8 @@ def frozen_return(policy: str) -> float:
 
 def mean_return(policy: Policy) -> float:
     """Return the mean return of the policy on the toy's first target, over its validation episodes."""
-    evaluator = Evaluator(TOY, 0)
-    policy.eval()
-    with deterministic():
+    with closing(Evaluator(TOY, 0)) as evaluator, deterministic():
         episodes = evaluator.evaluate(policy, TOY.target[:1])
-    policy.train()
-    evaluator.close()
     return sum(episode.total_reward for episode in episodes) / len(episodes)
 
 

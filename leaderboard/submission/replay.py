@@ -128,7 +128,6 @@ def _replay_episodes(subject: Subject, policies: Sequence[Policy]) -> Check:
             trials = [
                 Trial(scenario.task(row.task), row.split, row.episode) for row in rows if row.stage == stage
             ]
-            policy.eval()
             again += [episode_row(protocol.end(stage), episode) for episode in evaluator.play(policy, trials)]
     wrong = [
         f"{theirs.task} {theirs.split} episode {theirs.episode} of stage {theirs.stage} has "
