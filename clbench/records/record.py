@@ -212,17 +212,17 @@ class ScenarioInfo:
             ends: Steps of each stage of a finished run; None before it, or if all stages are equally long.
         """
         return Protocol(
-            tuple(self.retained),
-            tuple(self.target),
-            tuple(self.held_out),
-            tuple(self.evaluation_steps),
-            self.budget["validation_episodes"],
-            self.budget["test_episodes"],
-            self.budget["curve_episodes"],
-            split,
-            perturb,
-            self.budget.get("criterion"),
-            ends,
+            retained=tuple(self.retained),
+            target=tuple(self.target),
+            held_out=tuple(self.held_out),
+            steps=tuple(self.evaluation_steps),
+            validation_episodes=self.budget["validation_episodes"],
+            test_episodes=self.budget["test_episodes"],
+            curve_episodes=self.budget["curve_episodes"],
+            split=split,
+            perturb=perturb,
+            criterion=self.budget.get("criterion"),
+            ends=ends,
         )
 
 
