@@ -22,7 +22,7 @@ class Measurement:
     task: str
     """Name of the task."""
     group: str
-    """Part of the scenario that the task belongs to: "retained", "target" or "held_out"."""
+    """Part of the scenario that the task belongs to, see `Scenario.group`."""
     success: float
     """Share of the episodes that succeeded, from 0 to 1."""
     mean_return: float

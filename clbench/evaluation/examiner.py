@@ -54,7 +54,7 @@ class Examiner:
         self._evaluator = Evaluator(scenario, seed)
 
     @cached_property
-    def _asked(self) -> tuple[torch.Tensor, QuestionBatch]:
+    def _asked(self) -> tuple[Tensor, QuestionBatch]:
         """Kinds and questions to score: a tuning run must not see the test questions."""
         tuning = self._protocol.split == "validation"
         questions = self._data.questions if tuning else self._data.test_questions
