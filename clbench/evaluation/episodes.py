@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from clbench.base.progress import ProgressCallback, no_progress
+from clbench.base.progress import ProgressCallback
 from clbench.base.seeding import SPLIT_LABELS, derive_seed
 from clbench.data.access import check_episodes
 from clbench.spec.protocol import EpisodeKey, Split
@@ -109,7 +109,7 @@ def play_in_lanes(
     begin: Callable[[Live], None],
     act: Act,
     *,
-    progress: ProgressCallback = no_progress,
+    progress: ProgressCallback,
     watch: Watch = lambda _, __: None,
     enough: Callable[[Episode], bool] = lambda _: False,
 ) -> list[Episode]:

@@ -256,7 +256,7 @@ def interval(
     return Estimate(value, min(float(low), value), max(float(high), value), of_seeds=degrees > 0)
 
 
-def mean_of_seeds(values: Sequence[float], span: Span = UNBOUNDED, *, ratio: bool = False) -> Estimate:
+def mean_of_seeds(values: Sequence[float], span: Span, *, ratio: bool = False) -> Estimate:
     """Return the mean of one or more values, one for each seed, with its interval; none with one seed.
 
     `ratio` is that of `interval`.
@@ -267,7 +267,7 @@ def mean_of_seeds(values: Sequence[float], span: Span = UNBOUNDED, *, ratio: boo
     return interval(mean, np.array(without_one), span=span, ratio=ratio)
 
 
-def interval_of_seeds(value: float, error: float, degrees: int, span: Span = UNBOUNDED) -> Span:
+def interval_of_seeds(value: float, error: float, degrees: int, span: Span) -> Span:
     """Return the ends of the interval of a value, given its standard error over seeds.
 
     Without two bounds it is Student's: the value plus and minus quantile times error. Near a bound Student's

@@ -53,7 +53,7 @@ def built_in_methods() -> dict[str, EntryPoint]:
     return {name: entry for name, entry in installed_methods().items() if "/" not in name}
 
 
-def check_known(scenarios: Iterable[str] = (), methods: Iterable[str] = ()) -> None:
+def check_known(scenarios: Iterable[str], methods: Iterable[str]) -> None:
     """Refuse names that are not registered or installed; nothing is imported.
 
     Names with their module, "module:id" and "module:Class", pass: only the import can tell.

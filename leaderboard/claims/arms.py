@@ -82,7 +82,7 @@ def if_all_counted(arms: Sequence[str], verdict: Verdict, of_all: Verdict) -> tu
 def without_an_arm(
     evidence: Evidence,
     figures: Sequence[Figure],
-    controls: Sequence[Figure] = (),
+    controls: Sequence[Figure],
     of_all: Verdict | None = None,
 ) -> Finding:
     """Return the finding on a board on which no arm counts; `of_all` is the verdict if all did."""

@@ -265,7 +265,7 @@ class Evidence:
         form: str,
         span: Span = UNBOUNDED,
         *,
-        ratio: bool = False,
+        ratio: bool,
     ) -> Figure:
         """Return the mean of one value for each seed; none without a run, or if a value is no number."""
         if not values or not np.isfinite(values).all():
