@@ -150,7 +150,6 @@ def paired_difference(
     others: Runs,
     generator: np.random.Generator,
     *,
-    references: Mapping[str, Runs] | None = None,
     replicates: int = REPLICATES,
 ) -> Estimate:
     """Return the value of `metric` for `runs` minus that for `others`, over the seeds that both have.
@@ -160,11 +159,10 @@ def paired_difference(
     differences of answers are a little too wide.
 
     Args:
-        metric: Name of a metric.
+        metric: Name of a metric that needs no reference.
         runs: Runs of one method by seed.
         others: Runs of the other method by seed.
         generator: Source of the draws.
-        references: Runs of reference methods by name and seed.
         replicates: Number of draws.
 
     Raises:
@@ -175,11 +173,13 @@ def paired_difference(
     seeds = sorted(set(runs) & set(others))
     if not seeds:
         return NO_ESTIMATE
-    methods = [[them[seed] for seed in seeds] for them in (runs, others)]
-    samples = _Samples(methods, needed_references([wanted], seeds, references), generator, replicates)
     reach = wanted.high - wanted.low
-    return samples.estimate(
-        lambda rates: wanted.over_runs(rates[0]) - wanted.over_runs(rates[1]), (-reach, reach)
+    return bootstrap(
+        lambda of: wanted.over_runs(of["one"]) - wanted.over_runs(of["other"]),
+        {"one": [runs[seed] for seed in seeds], "other": [others[seed] for seed in seeds]},
+        generator,
+        span=(-reach, reach),
+        replicates=replicates,
     )
 
 
