@@ -29,8 +29,6 @@ from clbench.scoring.rates import Rates
 if TYPE_CHECKING:
     import pandas
 
-TIE = 1e-9
-"""Greatest difference of two values that count as equal: they differ by rounding."""
 PROBES = 64
 """Matrices that are tried at once; more are hardly faster, and take more memory."""
 REPEATED = "gain"
@@ -282,15 +280,8 @@ def _flips(values: Mapping[str, Mapping[str, Value]]) -> Iterator[Flip]:
         names = (name for name, one in DEFINITIONS.items() if one.family == family)
         for name in (name for name in names if name != REPEATED):
             sides = values[name][first].value, values[name][second].value
-            ahead = _ahead(METRICS[name], *sides)
+            ahead = METRICS[name].is_ahead(*sides)
             if ahead is not None:
                 better[ahead].append(name)
         if better[True] and better[False]:
             yield Flip(family, first, second, tuple(better[True]), tuple(better[False]))
-
-
-def _ahead(metric: Metric, first: float | None, second: float | None) -> bool | None:
-    """Return whether the first value is better than the second; None if neither is, or one is missing."""
-    if first is None or second is None or metric.higher_is_better is None or abs(first - second) <= TIE:
-        return None
-    return (first > second) == metric.higher_is_better

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from clbench.base.errors import InputError
 from clbench.scoring.intervals import MANY, Runs, studentised_range_quantile
 from clbench.scoring.layout import Array
-from clbench.scoring.metric import Metric
+from clbench.scoring.metric import TIE, Metric
 from clbench.scoring.metrics import METRICS, load_metric, measure
 from clbench.scoring.rates import check_same
 from clbench.scoring.scores import rates_of
@@ -235,8 +235,7 @@ class _Board:
         found = np.zeros((len(self.values), len(self.values)), dtype=np.bool_)
         for better, worse in combinations(range(len(self.values)), 2):
             difference, needed = self.compare(better, worse)
-            # Values are quotients of whole numbers: equal ones may differ in the last bit.
-            found[better, worse] = found[worse, better] = difference > needed + 1e-9
+            found[better, worse] = found[worse, better] = difference > needed + TIE
         return found
 
     def compare(self, better: int, worse: int) -> tuple[float, float]:

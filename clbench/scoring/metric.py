@@ -20,6 +20,9 @@ Function = Callable[[Rates], Array]
 DIFFERENCE = "difference of success rates"
 """Unit of a metric that takes success rates from each other."""
 
+TIE = 1e-9
+"""Greatest difference of equal values: quotients of whole numbers may differ in the last bit."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
@@ -79,6 +82,12 @@ class Metric(Facts):
             return self.function(rates.mean_over_runs())
         values = self.function(rates)
         return np.asarray(np.exp(np.log(values).mean(axis=-1)) if self.ratio else values.mean(axis=-1))
+
+    def is_ahead(self, value: float | None, other: float | None) -> bool | None:
+        """Return whether a value is better than another; None if neither is, or one is missing."""
+        if value is None or other is None or self.higher_is_better is None or abs(value - other) <= TIE:
+            return None
+        return bool(value > other) == self.higher_is_better
 
     @property
     def direction(self) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from clbench.scoring.layout import Array
+from clbench.scoring.metric import TIE
 
 REPLICATES = 2000
 """Bootstrap draws of seeds."""
@@ -87,8 +88,7 @@ def chance_of(one: Array, other: Array) -> float:
 
 
 def _signs(differences: Array) -> Array:
-    # Values are quotients of whole numbers: equal ones may differ in the last bit.
-    return np.where(np.abs(differences) < 1e-9, 0.0, np.sign(differences))
+    return np.where(np.abs(differences) < TIE, 0.0, np.sign(differences))
 
 
 def concordance(values: Array) -> Concordance | None:

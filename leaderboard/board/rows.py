@@ -20,6 +20,7 @@ from clbench.records.record import ScenarioInfo
 from clbench.runs.tuning import tuned
 from clbench.scoring.groups import groups
 from clbench.scoring.intervals import Estimate, Runs, estimate, row_generator
+from clbench.scoring.metric import TIE
 from clbench.scoring.metrics import METRICS, measure
 from clbench.spec.references import BASELINE
 
@@ -277,8 +278,7 @@ def standing_of(row: Row, rows: Iterable[Row]) -> Standing | None:
     if row.letters is None:
         return None
     division = [other for other in rows if other.division == row.division and other.letters is not None]
-    # Values are quotients of whole numbers: equal ones may differ in the last bit.
-    better = [other for other in division if _falling(other.height) < _falling(row.height) - 1e-9]
+    better = [other for other in division if _falling(other.height) < _falling(row.height) - TIE]
     alike = [other for other in division if other is not row and set(other.letters or "") & set(row.letters)]
     return Standing(1 + len(better), len(division), tuple(other.method for other in alike))
 

@@ -14,6 +14,7 @@ from rich.text import Text
 
 from clbench.base.text import listed
 from clbench.scoring.intervals import Estimate
+from clbench.scoring.metric import TIE
 from clbench.scoring.metrics import METRICS
 
 from ..board.overall import OverallRow, overall
@@ -152,8 +153,7 @@ def _width(table: TextTable) -> int:
 
 
 def _is_best(value: float | None, best: float | None) -> bool:
-    """Return whether a value is the best one: equal ones may differ in the last bit."""
-    return value is not None and best is not None and abs(value - best) < 1e-9
+    return value is not None and best is not None and abs(value - best) < TIE
 
 
 def _table(

@@ -25,6 +25,14 @@ def test_a_metric_is_found_by_its_title_on_the_board() -> None:
     assert load_metric("final average") is METRICS["final_average"]
 
 
+def test_a_value_is_ahead_only_if_it_is_better_by_more_than_the_last_bit() -> None:
+    retention, forgetting = METRICS["retention"], METRICS["forgetting"]
+    assert retention.is_ahead(0.3, 0.2) is forgetting.is_ahead(0.2, 0.3) is True
+    assert retention.is_ahead(0.2, 0.3) is forgetting.is_ahead(0.3, 0.2) is False
+    assert retention.is_ahead(0.1 + 0.2, 0.3) is retention.is_ahead(None, 0.3) is None
+    assert METRICS["shift"].is_ahead(0.3, 0.2) is None
+
+
 @pytest.mark.parametrize(
     ("usual", "name"),
     [

@@ -24,9 +24,6 @@ OF_CURVES: Mapping[str, tuple[str, ...]] = {
 }
 """Their members that need learning curves, which `DEFINITIONS` leaves out: a success matrix has none."""
 
-EQUAL = 1e-9
-"""Values closer than this are equal: rates are quotients of integers whose last bit may differ."""
-
 
 @dataclass(frozen=True)
 class Family:
@@ -63,20 +60,13 @@ def families(rows: Sequence[Row]) -> list[Family]:
     return found
 
 
-def _better(metric: Metric, one: Estimate, other: Estimate) -> int:
-    """Return 1 if `one` is better than `other`, -1 if worse, 0 if equal or missing."""
-    if one.value is None or other.value is None or abs(one.value - other.value) <= EQUAL:
-        return 0
-    return 1 if (one.value > other.value) == metric.higher_is_better else -1
-
-
 def _ranks(metric: Metric, rows: Sequence[Row]) -> dict[str, int | None]:
     """Return the rank of each method: one more than the number of better methods."""
-    values = {row.method: row.estimates[metric.name] for row in rows}
+    values = {row.method: row.estimates[metric.name].value for row in rows}
     return {
         method: None
-        if own.value is None
-        else 1 + sum(_better(metric, other, own) > 0 for other in values.values())
+        if own is None
+        else 1 + sum(metric.is_ahead(other, own) is True for other in values.values())
         for method, own in values.items()
     }
 
@@ -88,9 +78,7 @@ def _disagreements(metrics: Iterable[Metric], rows: Sequence[Row]) -> tuple[froz
     worst, clear, names = 0, 0, ("", "")
     for first, second in combinations(metrics, 2):
         opposed = [
-            pair
-            for pair in pairs
-            if _better(first, *_values(first, pair)) * _better(second, *_values(second, pair)) < 0
+            pair for pair in pairs if {_is_ahead(one, pair) for one in (first, second)} == {True, False}
         ]
         apart = [pair for pair in opposed if all(_apart(*_values(one, pair)) for one in (first, second))]
         depends.update(row.method for pair in apart for row in pair)
@@ -102,6 +90,10 @@ def _disagreements(metrics: Iterable[Metric], rows: Sequence[Row]) -> tuple[froz
         f"“{title_of(names[0])}” and “{title_of(names[1])}” disagree most. They put {worst} of {len(pairs)} "
         f"pairs of methods in opposite orders; for {clear} of these, the intervals overlap under neither."
     )
+
+
+def _is_ahead(metric: Metric, pair: tuple[Row, Row]) -> bool | None:
+    return metric.is_ahead(*(one.value for one in _values(metric, pair)))
 
 
 def _values(metric: Metric, pair: tuple[Row, Row]) -> tuple[Estimate, Estimate]:

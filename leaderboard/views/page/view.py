@@ -8,7 +8,7 @@ from functools import cached_property
 
 from clbench.base.text import counted, printable
 from clbench.records.paths import table_parts
-from clbench.scoring.metric import Metric
+from clbench.scoring.metric import TIE, Metric
 from clbench.spec.policies import DEFAULT_POLICY, POLICIES, is_built_in, kind_of, size_of
 from clbench.spec.references import BASELINE
 
@@ -82,7 +82,7 @@ class ScenarioView:
             values = [
                 (row.estimates[metric].value, row.height) for row in self.table if row.height is not None
             ]
-            if all(value is not None and abs(value - height) < 1e-9 for value, height in values):
+            if all(value is not None and abs(value - height) < TIE for value, height in values):
                 return metric
         return "letters"
 
