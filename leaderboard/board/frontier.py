@@ -10,7 +10,6 @@ import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import groupby
 from pathlib import Path
 
 from clbench.records.paths import label_of
@@ -80,7 +79,7 @@ def frontiers_of(ladder: Sequence[Run]) -> dict[str, tuple[Curve, ...]]:
 
     A scenario with one learning rate has no curves: its runs are for the claims.
     """
-    by_table = {table: list(members) for table, members in groupby(ladder, lambda run: run.table)}
+    by_table = grouped((run.table, run) for run in ladder)
     return {table: _curves(members) for table, members in by_table.items() if _is_ladder(members)}
 
 

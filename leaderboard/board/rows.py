@@ -9,7 +9,7 @@ import math
 import statistics
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field
-from itertools import chain, groupby
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -88,8 +88,8 @@ def compute_board(records: Path, only: Container[str] | None = None) -> Board:
     check_folder(records)
     runs, not_shown = read_runs(records, read_run, ALIKE, only)
     runs, alone = _beside_rows(runs)
-    by_table = groupby(sorted(runs, key=lambda run: run.table), key=lambda run: run.table)
-    found = [_scenario_rows(list(members)) for _, members in by_table]
+    by_table = grouped((run.table, run) for run in sorted(runs, key=lambda run: run.table))
+    found = [_scenario_rows(members) for members in by_table.values()]
     found.sort(key=lambda rows: not rows[0].to_criterion)  # stages to a criterion first
     by_name = {rows[0].scenario: rows for rows in found}
     ladder, without = read_ladder(ladder_of(records)) if only is None else ([], [])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import groupby
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
@@ -12,6 +11,7 @@ from rich.text import Text
 from clbench.base.text import counted
 
 from ..board.commands import run_command
+from ..board.summary import grouped
 from ..claims.claim import tally
 from ..claims.evidence import LEAST_SEEDS, Figure
 from ..claims.judges import Judged
@@ -58,13 +58,13 @@ INTRODUCTION = (
 
 def page(judged: Sequence[Judged]) -> str:
     """Return the page as Markdown."""
-    by_claim = [(claim, list(members)) for claim, members in groupby(judged, key=lambda one: one.claim)]
+    by_claim = grouped((one.claim, one) for one in judged)
     refused = {entry.path: entry for one in judged for entry in one.evidence.not_used}
     return template(__file__, "claims.md.jinja").render(
         introduction=INTRODUCTION.format(seeds=LEAST_SEEDS, missing=MISSING),
         tally=_tally(judged),
         judged=judged,
-        papers=groupby(by_claim, key=lambda pair: pair[0].paper),
+        papers=grouped((claim.paper, (claim, members)) for claim, members in by_claim.items()).items(),
         not_used=list(refused.values()),
         missing=_missing,
     )

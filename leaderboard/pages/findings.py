@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 
 from clbench.base.text import counted, listed, megabytes
 from clbench.records.paths import table_parts
@@ -173,9 +172,7 @@ def _learning_rates(board: Board, evidence: Callable[[str], Evidence]) -> Sectio
 def _claims(judged: Sequence[Judged]) -> Section:
     """Which claims of the papers hold."""
     answers = []
-    by_paper = groupby(judged, key=lambda one: one.claim.paper.name)
-    for paper, members in by_paper:
-        every = list(members)
+    for paper, every in grouped((one.claim.paper.name, one) for one in judged).items():
         answers.append(
             f"{paper}: {tally(one.finding.verdict for one in every)}.{_those_that_hold(every)}{_ours(every)}"
         )
@@ -362,9 +359,7 @@ def _undecided(judged: Sequence[Judged]) -> Section:
     )
     for verdict, why in reasons:
         found = [one for one in judged if one.finding.verdict == verdict]
-        for scenario, members in groupby(
-            sorted(found, key=lambda one: one.evidence.scenario), key=lambda one: one.evidence.scenario
-        ):
-            names = [one.claim.id for one in members]
+        ids = grouped((one.evidence.scenario, one.claim.id) for one in found)
+        for scenario, names in sorted(ids.items()):
             answers.append(f"{scenario}: {', '.join(names)} {PREDICATES[verdict][len(names) > 1]}; {why}.")
     return Section("What can the records not tell?", tuple(answers))

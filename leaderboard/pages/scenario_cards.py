@@ -37,7 +37,7 @@ from clbench.spec.scenario import Scenario
 from ..board.commands import run_command
 from ..board.rows import Board, Row
 from ..board.runs import differences
-from ..board.summary import METHODS, RANKED_BY, grouped
+from ..board.summary import METHODS, RANKED_BY, divisions_of, grouped
 from ..views.format import MISSING
 from ..views.markdown import template
 from .scenario_spaces import spaces_of
@@ -130,7 +130,7 @@ class Card:
         needed = COMPARED if self.scenario.budget.criterion is None else (*COMPARED, "experience_replay")
         missing = [name for name in needed if name not in self.rows]
         competing = [row for row in self.rows.values() if row.division in METHODS]
-        largest = _largest_division(competing)
+        largest = max(divisions_of(competing).values(), key=len, default=[])
         meanings, values = field_docstrings(Budget), dataclasses.asdict(self.scenario.budget)
         references = [
             (row.method, [row.estimates[name] for name in COLUMNS], len(row.seeds)) for row in present
@@ -268,17 +268,10 @@ def _resolution(competing: Sequence[Row]) -> dict[str, list[float]]:
     return found
 
 
-def _largest_division(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows of the division with the most rows."""
-    by_division = [[row for row in rows if row.division == division] for division in METHODS]
-    return max(by_division, key=len)
-
-
 def _group_counts(competing: Sequence[Row]) -> list[tuple[str, int, int]]:
     """Return how many methods each division has, and how many groups they form on the board."""
     found = []
-    for division in METHODS:
-        members = [row for row in competing if row.division == division and row.letters]
+    for division, members in divisions_of(row for row in competing if row.letters).items():
         if len(members) > 1:
             letters = {letter for row in members for letter in row.letters or ""}
             found.append((division, len(members), len(letters)))
