@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Sequence
 from typing import Any
 
 from clbench.spec.references import BASELINE
 
-from .runs import Run, is_number
+from .runs import Run, is_number, mean_of
 from .summary import COSTS
 
 
@@ -22,8 +21,7 @@ def step_ratio(run: Run) -> float | None:
 
 def mean_step_ratio(runs: Sequence[Run]) -> float | None:
     """Return the mean of `step_ratio` over the runs that measured it, None without one."""
-    times = [ratio for run in runs if (ratio := step_ratio(run)) is not None]
-    return statistics.fmean(times) if times else None
+    return mean_of(map(step_ratio, runs))
 
 
 def costs_of(runs: Sequence[Run], baseline: Sequence[Run]) -> dict[str, float | None]:
@@ -54,5 +52,4 @@ def costs_of(runs: Sequence[Run], baseline: Sequence[Run]) -> dict[str, float | 
 def _mean(runs: Sequence[Run], name: str) -> float | None:
     """Return the mean of a cost over runs, None if a run does not state it."""
     values = [getattr(run.record.costs, name) for run in runs]
-    numbers = [value for value in values if is_number(value)]
-    return statistics.fmean(numbers) if numbers and len(numbers) == len(values) else None
+    return mean_of(values) if all(map(is_number, values)) else None

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 from clbench.scoring.metrics import measure
 
-from .runs import Run
+from .runs import Run, mean_of
 
 LEAST_ORDERS = 3
 """Fewest orders for a range; over fewer it means little."""
@@ -59,5 +58,4 @@ def orders_of(runs: Iterable[Run]) -> Orders:
 
 def _final_average(runs: list[Run]) -> float | None:
     values = [measure("final_average", run.scores) for run in runs]
-    known = [value for value in values if value is not None]
-    return statistics.fmean(known) if known and len(known) == len(values) else None
+    return None if None in values else mean_of(values)

@@ -6,7 +6,6 @@ They are made from the records alone.
 from __future__ import annotations
 
 import math
-import statistics
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
@@ -28,7 +27,7 @@ from .agreement import Concordance, concordance
 from .costs import costs_of
 from .frontier import Curve, TiedGain, frontiers_of, ladder_of, read_ladder, tied_gains
 from .orders import Orders, orders_of
-from .runs import ALIKE, Run, Sifted, read_run, read_runs, sift_by
+from .runs import ALIKE, Run, Sifted, mean_of, read_run, read_runs, sift_by
 from .summary import (
     DIVISIONS,
     ELSEWHERE,
@@ -181,9 +180,7 @@ def pretrained_success(rows: Iterable[Row]) -> float | None:
     row = next((row for row in begins if row.method == BASELINE), begins[0] if begins else None)
     if row is None:
         return None
-    rates = [run.record.retained_at_start() for run in row.runs]
-    known = [rate for rate in rates if rate is not None]
-    return statistics.fmean(known) if known else None
+    return mean_of(run.record.retained_at_start() for run in row.runs)
 
 
 def unpaired(rows: Iterable[Row]) -> dict[str, list[int]]:
@@ -217,8 +214,7 @@ def mean_difference(metric: str, runs: Runs, others: Runs) -> float | None:
         [measure(metric, them[seed]) for them in (runs, others)]
         for seed in sorted(runs.keys() & others.keys())
     ]
-    differences = [one - other for one, other in pairs if one is not None and other is not None]
-    return statistics.fmean(differences) if differences else None
+    return mean_of(one - other for one, other in pairs if one is not None and other is not None)
 
 
 def _heights(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import statistics
 from collections.abc import Callable, Container, Hashable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -419,6 +420,12 @@ def differences(values: Any, others: Any) -> list[str]:
     return [
         name for name in names if name not in values or name not in others or values[name] != others[name]
     ]
+
+
+def mean_of(values: Iterable[float | None]) -> float | None:
+    """Return the mean of the values that are known, None without one."""
+    known = [value for value in values if value is not None]
+    return statistics.fmean(known) if known else None
 
 
 def is_number(value: Any) -> bool:

@@ -121,7 +121,8 @@ class Evidence:
         *methods: str,
         span: Span = UNBOUNDED,
         ratio: bool = False,
-        **rest: Any,
+        note: str = "",
+        form: str = ".2f",
     ) -> Figure:
         """Return `quantity` with its interval, over the seeds that all methods have.
 
@@ -131,7 +132,8 @@ class Evidence:
             methods: Labels of all methods that `quantity` reads, the subject first.
             span: Smallest and largest possible value.
             ratio: Whether the values are positive ratios, see `clbench.scoring.intervals.interval`.
-            rest: Further fields of the figure.
+            note: Restriction of the figure, in words. Without one, it says why the figure decides nothing.
+            form: Format of the number.
         """
         methods = tuple(dict.fromkeys(methods))
         missing = tuple(label for label in methods if label not in self.runs)
@@ -141,13 +143,14 @@ class Evidence:
             generator = row_generator(self.scenario, what)
             scores = self._scores(methods, common)
             found = bootstrap(quantity, scores, generator, span=span, ratio=ratio)
-        if not missing and not common:
-            rest.setdefault("note", "the methods have no seed in common")
-        elif not missing and found.value is None:
-            rest.setdefault("note", "not measured in these records")
-        elif not missing and len(common) < LEAST_SEEDS:
-            rest.setdefault("note", "one seed: the interval does not cover other seeds and decides nothing")
-        return Figure(what, methods, found, common, missing, **rest)
+        if not missing and not note:
+            if not common:
+                note = "the methods have no seed in common"
+            elif found.value is None:
+                note = "not measured in these records"
+            elif len(common) < LEAST_SEEDS:
+                note = "one seed: the interval does not cover other seeds and decides nothing"
+        return Figure(what, methods, found, common, missing, note, form)
 
     def _scores(self, methods: Iterable[str], seeds: Iterable[int]) -> dict[str, list[Scores]]:
         return {label: [self.runs[label][seed].scores for seed in seeds] for label in methods}
@@ -157,19 +160,19 @@ class Evidence:
         seeds = [set(self.runs.get(label, {})) for label in methods]
         return tuple(sorted(set.intersection(*seeds))) if seeds else ()
 
-    def metric(self, name: str, method: str, **rest: Any) -> Figure:
+    def metric(self, name: str, method: str) -> Figure:
         """Return a metric of one method."""
         metric = load_metric(name)
         what, span = f"{_words(name)} of {method}", (metric.low, metric.high)
-        return self.figure(what, measured(name, method), method, *metric.references, span=span, **rest)
+        return self.figure(what, measured(name, method), method, *metric.references, span=span)
 
-    def difference(self, name: str, method: str, other: str, **rest: Any) -> Figure:
+    def difference(self, name: str, method: str, other: str, form: str = ".2f") -> Figure:
         """Return the difference of a metric between two methods."""
         one, two = measured(name, method), measured(name, other)
         metric = load_metric(name)
         methods, reach = (method, other, *metric.references), metric.high - metric.low
         what = f"{_words(name)}, {method} - {other}"
-        return self.figure(what, lambda of: one(of) - two(of), *methods, span=(-reach, reach), **rest)
+        return self.figure(what, lambda of: one(of) - two(of), *methods, span=(-reach, reach), form=form)
 
     # ---- figures of costs and diagnostics ----------------------------------------------------------
 

@@ -40,8 +40,7 @@ def kept(evidence: Evidence, method: str, other: str) -> Figure:
         return average(first - second)
 
     what, note = f"retained success, {method} - {other}", _settings(evidence, method, other)
-    rest: dict[str, Any] = {"note": note} if note else {}
-    return evidence.figure(what, difference, method, other, span=(-1, 1), **rest)
+    return evidence.figure(what, difference, method, other, span=(-1, 1), note=note)
 
 
 TOLD = ("replay", "tau_start", "loss_scale", "orthogonal", "schedule", "step_factor")
@@ -72,8 +71,7 @@ def share_of_steps(evidence: Evidence, method: str, other: str) -> Figure:
         return np.exp(average(average(first - second)))
 
     what, note = f"steps to the criterion, {method} / {other}", _settings(evidence, method, other)
-    rest: dict[str, Any] = {"note": note} if note else {}
-    return evidence.figure(what, ratio, method, other, ratio=True, **rest)
+    return evidence.figure(what, ratio, method, other, ratio=True, note=note)
 
 
 def question_drop(evidence: Evidence, method: str) -> Figure:
