@@ -76,10 +76,10 @@ def inputs_of(records: Path) -> dict[str, str]:
         "records": _folder_hash(records),
         "ladder": _folder_hash(ladder_of(records)),
         "pictures": hash_of(
-            {path.relative_to(CARDS).as_posix(): _text_hash(path.read_bytes()) for path in pictures}
+            {path.relative_to(CARDS).as_posix(): _hash_of_bytes(path.read_bytes()) for path in pictures}
         ),
-        "decoding": _text_hash(RESULTS.read_bytes()) if RESULTS.is_file() else "",
-        "definitions": _text_hash(pinned_file().read_bytes()),
+        "decoding": _hash_of_bytes(RESULTS.read_bytes()) if RESULTS.is_file() else "",
+        "definitions": _hash_of_bytes(pinned_file().read_bytes()),
         "code": source_hash(*_CODE, *packages),
     }
 
@@ -90,7 +90,7 @@ def _folder_hash(folder: Path) -> str:
     for parent, folders, names in os.walk(folder):
         for path in (Path(parent, name) for name in (*folders, *names)):
             try:
-                content = hashlib.sha256(read_regular(path)).hexdigest()
+                content = _hash_of_bytes(read_regular(path))
             except StrictJSONError as error:  # the reader of records refuses it with the same message
                 content = str(error)
             except OSError as error:
@@ -104,7 +104,7 @@ def read_unchanged(records: Path, inputs: dict[str, str]) -> Summary | None:
     site = site_of(records)
     try:
         kept: dict[str, Any] = json.loads(read_regular(site / NUMBERS))
-        files = {name: _text_hash(read_regular(site / name)) for name in kept["files"]}
+        files = {name: _hash_of_bytes(read_regular(site / name)) for name in kept["files"]}
         whole = kept["files"] == files and kept["content"] == content_hash(kept)
         return Summary.from_json(kept["board"]) if whole and kept["made_from"] == inputs else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):  # none yet, or damaged
@@ -136,7 +136,7 @@ def write_site(board: Board, records: Path, inputs: dict[str, str]) -> list[Path
         "index.html": web_page.page(board, comparisons),
         **web_page.pictures(board),
     }
-    files = {name: _text_hash(text.encode()) for name, text in texts.items()}
+    files = {name: _hash_of_bytes(text.encode()) for name, text in texts.items()}
     kept = {"made_from": inputs, "files": files, "board": board.to_json()}
     texts[NUMBERS] = json.dumps({**kept, "content": content_hash(kept)}, indent=1) + "\n"
     site = site_of(records)
@@ -157,5 +157,5 @@ def _files_of(site: Path) -> set[str]:
     return {name for name in names if isinstance(name, str) and Path(name).name == name}
 
 
-def _text_hash(content: bytes) -> str:
+def _hash_of_bytes(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()

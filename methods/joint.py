@@ -19,6 +19,8 @@ from clbench.learning.prior import Prior, Source, Uses
 from clbench.policy.batch import Batch, QuestionBatch
 from clbench.policy.policy import Policy
 
+from ._questions import with_questions
+
 
 @dataclass
 class Joint(Method):
@@ -29,11 +31,10 @@ class Joint(Method):
 
     def batch(self, target: Source[Batch], prior: Prior) -> tuple[Batch, QuestionBatch]:
         """Return target samples, as many prior samples if there are any, and half as many questions."""
-        size = target.batch_size
-        batch = target.sample(size)
+        batch, questions = with_questions(target, prior.questions)
         if len(prior.demonstrations):
-            batch = Batch.cat([batch, prior.demonstrations.sample(size)])
-        return batch, prior.questions.sample(size // 2)
+            batch = Batch.cat([batch, prior.demonstrations.sample(target.batch_size)])
+        return batch, questions
 
     def loss(self, policy: Policy, batch: tuple[Batch, QuestionBatch], progress: Progress) -> Tensor:
         """Return the sum of the action loss and the answer loss, which pretraining also minimises."""

@@ -264,7 +264,7 @@ def _write_dataset(
 def _env_spec(task: Task) -> EnvSpec:
     """Return the environment of a task's dataset, which `recover_environment()` of the dataset makes."""
     return EnvSpec(
-        f"clbench/{task.suite}.{task.name}-v{task.version}",
+        task.environment_id,
         entry_point="clbench.worlds.world:one_task",
         max_episode_steps=task.horizon,
         kwargs={"world": task.world, "task": task.name},

@@ -89,11 +89,10 @@ def _dones(episode: Demonstration) -> NDArray[np.uint8]:
 def _attributes(task: Task, episodes: Sequence[Demonstration]) -> dict[str, Any]:
     """Return the attributes of the group `data`."""
     kwargs = {"world": task.world, "task": task.name, "control_freq": steps_per_second(task)}
-    name = f"clbench/{task.suite}.{task.name}-v{task.version}"
     return {
         "total": sum(len(episode.executed) for episode in episodes),
         "num_demos": len(episodes),
-        "env_args": json.dumps({"env_name": name, "type": GYM, "env_kwargs": kwargs}),
+        "env_args": json.dumps({"env_name": task.environment_id, "type": GYM, "env_kwargs": kwargs}),
         "problem_info": json.dumps({"language_instruction": task.instructions[0]}),
         "instructions": json.dumps(task.instructions),
         "expert": task.expert,

@@ -91,6 +91,11 @@ class Task:
         """Id of the Minari dataset that holds the demonstrations."""
         return f"clbench/{self.seed_suite}/{self.name.replace('_', '-')}-v{self.version}"
 
+    @property
+    def environment_id(self) -> str:
+        """Id of the environment in the task's dataset, and in its exports."""
+        return f"clbench/{self.suite}.{self.name}-v{self.version}"
+
 
 def packages_of(tasks: Iterable[Task], *parts: str) -> list[str]:
     """Return the packages of some parts of the tasks, such as "world", "expert" and "camera", sorted."""
