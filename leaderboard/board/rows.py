@@ -31,12 +31,12 @@ from .runs import ALIKE, Run, Sifted, mean_of, read_run, read_runs, sift_by
 from .summary import (
     DIVISIONS,
     ELSEWHERE,
-    METHODS,
     RANKED_BY,
     WITH_DEMONSTRATIONS,
     WITHOUT_DEMONSTRATIONS,
     RowSummary,
     Summary,
+    competing,
     grouped,
 )
 from .tiers import TIERS
@@ -106,7 +106,7 @@ def compute_board(records: Path, only: Container[str] | None = None) -> Board:
 
 def _rivals(rows: Iterable[Row]) -> dict[str, Runs]:
     """Return the scores of the rows that compete, plain fine-tuning at the chosen setting among them."""
-    return {row.method: row.scores for row in rows if row.division in METHODS}
+    return {row.method: row.scores for row in competing(rows)}
 
 
 def _beside_rows(runs: list[Run]) -> Sifted:
@@ -176,7 +176,7 @@ def pretrained_success(rows: Iterable[Row]) -> float | None:
 
     The row is that of plain fine-tuning or, without one, the first one of a method that fine-tunes.
     """
-    begins = [row for row in rows if row.division in METHODS]
+    begins = competing(rows)
     row = next((row for row in begins if row.method == BASELINE), begins[0] if begins else None)
     if row is None:
         return None
@@ -315,10 +315,10 @@ def values_by_seed(rows: Iterable[Row], metric: str = RANKED_BY) -> dict[str, li
         rows: Rows of a scenario.
         metric: Name of a metric that needs no reference.
     """
-    competing = [row for row in rows if row.division in METHODS]
-    seeds = next((row.seeds for row in competing if row.method == BASELINE), ())
+    members = competing(rows)
+    seeds = next((row.seeds for row in members if row.method == BASELINE), ())
     found = {}
-    for row in competing:
+    for row in members:
         if seeds and set(seeds) <= set(row.seeds):
             values = [measure(metric, row.scores[seed]) for seed in seeds]
             if None not in values:

@@ -186,6 +186,11 @@ def divisions_of(rows: Iterable[PlacedRow]) -> dict[str, list[PlacedRow]]:
     return grouped((row.division, row) for row in rows)
 
 
+def competing(rows: Iterable[PlacedRow]) -> list[PlacedRow]:
+    """Return the rows of methods, which compete: references and what another program trained do not."""
+    return [row for row in rows if row.division in METHODS]
+
+
 def grouped(pairs: Iterable[tuple[Key, Value]]) -> dict[Key, list[Value]]:
     """Return the values of each key, in their order."""
     found: dict[Key, list[Value]] = {}

@@ -28,7 +28,7 @@ from ..views.markdown import template
 from ..views.page.charts.picture import in_both_themes
 from .agreements import after_correction, agreement_sentences, without_demonstrations
 from .findings_chart import gains_chart
-from .gains import Tied, competing, gain_sentences, gain_table
+from .gains import Tied, by_gain, gain_sentences, gain_table
 from .learning_rates import rate_lines, rate_sentences
 from .lost_skills import relearning_sentences
 
@@ -59,7 +59,7 @@ def page(found: Sequence[Section]) -> str:
 
 def pictures(board: Board) -> dict[str, str]:
     """Return the pictures as SVG, for a light and a dark page, by the names of their files."""
-    rows = {name: competing(rows) for name, rows in _boards(board).items()}
+    rows = {name: by_gain(rows) for name, rows in _boards(board).items()}
     if not any(rows.values()):
         return {}
     return in_both_themes("gains", gains_chart(rows))
@@ -121,7 +121,7 @@ def _replay(boards: dict[str, list[Row]], tied: Tied) -> Section:
         baseline = next((row for row in rows if row.method == BASELINE), None)
         usual = f"{format_interval(_steps(baseline), '.0f')}{_never_met(baseline)}" if baseline else MISSING
         apart = apart_from_baseline(rows)
-        for row in competing(rows):
+        for row in by_gain(rows):
             kept = row.costs.get("bytes_kept")
             if row.division in WITHOUT_DEMONSTRATIONS or not kept:
                 continue

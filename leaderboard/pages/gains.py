@@ -12,16 +12,16 @@ from clbench.spec.references import BASELINE
 
 from ..board.frontier import TiedGain, is_certain_over
 from ..board.rows import Row, apart_from_baseline
-from ..board.summary import METHODS, RANKED_BY, WITHOUT_DEMONSTRATIONS
+from ..board.summary import RANKED_BY, WITHOUT_DEMONSTRATIONS, competing
 from ..views.format import MISSING, format_interval, over_tied, rate_text
 
 Tied = Mapping[str, Mapping[str, Sequence[TiedGain]]]
 """Gains over plain fine-tuning at tied settings by scenario and method: `Board.tied`."""
 
 
-def competing(rows: Iterable[Row]) -> list[Row]:
+def by_gain(rows: Iterable[Row]) -> list[Row]:
     """Return the rows of methods other than plain fine-tuning, by falling gain."""
-    found = [row for row in rows if row.division in METHODS and row.method != BASELINE]
+    found = [row for row in competing(rows) if row.method != BASELINE]
     known = [row for row in found if row.estimates["gain"].value is not None]
     return sorted(known, key=lambda row: -(row.estimates["gain"].value or 0.0))
 
@@ -33,7 +33,7 @@ def gain_table(
     has_tied = any(gains for name in boards for gains in tied.get(name, {}).values())
     lines = []
     for name, rows in boards.items():
-        for row in competing(rows):
+        for row in by_gain(rows):
             over = [format_interval(one.gain, ".3f") for one in tied.get(name, {}).get(row.method, ())]
             lines.append(
                 (
@@ -57,7 +57,7 @@ def gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[T
         rows: Its rows.
         tied: Gains over plain fine-tuning at tied settings, by method.
     """
-    others = [row for row in competing(rows) if row.division in WITHOUT_DEMONSTRATIONS]
+    others = [row for row in by_gain(rows) if row.division in WITHOUT_DEMONSTRATIONS]
     if not others or BASELINE not in {row.method for row in rows}:
         return
     gains = {row.method: row.estimates["gain"] for row in others}

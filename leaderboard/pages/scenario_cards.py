@@ -37,7 +37,7 @@ from clbench.spec.scenario import Scenario
 from ..board.commands import run_command
 from ..board.rows import Board, Row
 from ..board.runs import differences
-from ..board.summary import METHODS, RANKED_BY, divisions_of, grouped
+from ..board.summary import RANKED_BY, competing, divisions_of, grouped
 from ..views.format import MISSING
 from ..views.markdown import template
 from .scenario_spaces import spaces_of
@@ -129,8 +129,8 @@ class Card:
         present = [self.rows[name] for name in COMPARED if name in self.rows]
         needed = COMPARED if self.scenario.budget.criterion is None else (*COMPARED, "experience_replay")
         missing = [name for name in needed if name not in self.rows]
-        competing = [row for row in self.rows.values() if row.division in METHODS]
-        largest = max(divisions_of(competing).values(), key=len, default=[])
+        members = competing(self.rows.values())
+        largest = max(divisions_of(members).values(), key=len, default=[])
         meanings, values = field_docstrings(Budget), dataclasses.asdict(self.scenario.budget)
         references = [
             (row.method, [row.estimates[name] for name in COLUMNS], len(row.seeds)) for row in present
@@ -157,7 +157,7 @@ class Card:
             seed_counts=SEEDS,
             largest=largest,
             resolution=_resolution(largest) if len(largest) > 1 else {},
-            group_counts=_group_counts(competing),
+            group_counts=_group_counts(members),
             orders=[row for row in self.rows.values() if len(row.orders.orders) > 1],
             task_versions=self._task_versions(),
             recorded=[row.method for row in present],
@@ -253,25 +253,25 @@ class Card:
         return dict(sorted(grouped((task.version, task.name) for task in self.scenario.tasks).items()))
 
 
-def _resolution(competing: Sequence[Row]) -> dict[str, list[float]]:
+def _resolution(rows: Sequence[Row]) -> dict[str, list[float]]:
     """Return by metric the deviation of a difference, then the smallest difference for each of `SEEDS`.
 
     Args:
-        competing: The rows of a division, which the test of the board compares with each other.
+        rows: The rows of a division, which the test of the board compares with each other.
     """
     found = {}
     for metric in TELLING:
-        deviation = deviation_of_differences(metric, [row.scores for row in competing])
+        deviation = deviation_of_differences(metric, [row.scores for row in rows])
         if deviation:  # equal differences for all seeds tell nothing
-            needed = [least_difference(deviation, len(competing), seeds) for seeds in SEEDS]
+            needed = [least_difference(deviation, len(rows), seeds) for seeds in SEEDS]
             found[metric] = [deviation, *needed]
     return found
 
 
-def _group_counts(competing: Sequence[Row]) -> list[tuple[str, int, int]]:
+def _group_counts(rows: Sequence[Row]) -> list[tuple[str, int, int]]:
     """Return how many methods each division has, and how many groups they form on the board."""
     found = []
-    for division, members in divisions_of(row for row in competing if row.letters).items():
+    for division, members in divisions_of(row for row in rows if row.letters).items():
         if len(members) > 1:
             letters = {letter for row in members for letter in row.letters or ""}
             found.append((division, len(members), len(letters)))

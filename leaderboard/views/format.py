@@ -68,6 +68,9 @@ FITTING_FIXED = (
 FITTING_TO_CRITERION = ("final_average", "gain", "adaptation", "retention", "kept")
 """Metrics of `TO_CRITERION` in a terminal of 108 columns."""
 
+NAMED = 3
+"""Number of methods that a sentence names; further ones are only counted."""
+
 MISSING = "-"
 """Text for a value that could not be computed."""
 

@@ -10,7 +10,7 @@ from clbench.scoring.metrics import METRICS
 from clbench.spec.policies import DEFAULT_POLICY
 
 from ...board.rows import Row
-from ...board.summary import DIVISIONS, METHODS, RANKED_BY
+from ...board.summary import DIVISIONS, RANKED_BY, competing
 from ..format import Column, column_title
 from .charts.vega import finite
 from .numbers import MISSING, Number, number
@@ -60,7 +60,7 @@ def heat_maps(tables: Mapping[str, Sequence[Row]]) -> list[HeatMap]:
         chosen = {
             name: {row.method: row for row in rows}
             for name, rows in tables.items()
-            if table_parts(name)[1] == policy and sum(row.division in METHODS for row in rows) > 1
+            if table_parts(name)[1] == policy and len(competing(rows)) > 1
         }
         if chosen:
             found.append(HeatMap(policy, tuple(chosen), tuple(_rows(chosen))))

@@ -21,6 +21,7 @@ from ...board.rows import Row, standing_of
 from ...board.summary import DIVISIONS, ELSEWHERE, RANKED_BY, letters_of
 from ..descriptions import Description, describe
 from ..format import (
+    NAMED,
     Column,
     Rows,
     aligned,
@@ -43,9 +44,6 @@ STEPS = {
     "environment_steps": "environment steps, in all stages",
 }
 """Titles of costs that say what is counted; all costs are means over seeds."""
-
-NAMED = 3
-"""Number of methods not told apart from a row that are named; further ones are only counted."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ class MatrixLine:
     """Column of the task that this stage learned."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class RowView:
     """A row and its section."""
 
@@ -214,17 +212,17 @@ def places(row: Row) -> tuple[str, ...]:
 
 def row_view(row: Row, rows: Sequence[Row]) -> RowView:
     """Return the view of a row, given all rows of its scenario."""
-    seeds = _of_seeds(row, rows)
+    seeds, table = _of_seeds(row, rows), columns(rows)
     return RowView(
-        row,
-        _letters(row, rows),
-        standing.place if (standing := standing_of(row, rows)) else None,
-        standing_text(row, rows, NAMED),
-        tuple(number(row.estimates[one.metric.name], one) for one in columns(rows)),
-        tuple(_metric(one, row.estimates[one.metric.name], seeds[one.metric.name]) for one in columns(rows)),
-        tuple(_stages(row)),
-        _drawn(row, seeds, others(rows)),
-        _description(row.method) if row.method in built_in_methods() else None,
+        row=row,
+        letters=_letters(row, rows),
+        place=standing.place if (standing := standing_of(row, rows)) else None,
+        standing=standing_text(row, rows, NAMED),
+        cells=tuple(number(row.estimates[one.metric.name], one) for one in table),
+        metrics=tuple(_metric(one, row.estimates[one.metric.name], seeds[one.metric.name]) for one in table),
+        stages=tuple(_stages(row)),
+        data=_drawn(row, seeds, others(rows)),
+        description=_description(row.method) if row.method in built_in_methods() else None,
     )
 
 

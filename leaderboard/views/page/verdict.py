@@ -19,14 +19,12 @@ from ...board.summary import (
     RANKED_BY,
     WITH_DEMONSTRATIONS,
     WITHOUT_DEMONSTRATIONS,
+    competing,
     divisions_of,
 )
 from ..descriptions import RULES
-from ..format import format_interval, number_text, rate_text
+from ..format import NAMED, format_interval, number_text, rate_text
 from .numbers import MISSING, cost, size
-
-NAMED = 3
-"""Number of methods that a sentence names; further ones are only counted."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +37,7 @@ class Fact:
     """Its interval, or what it is a multiple of."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Verdict:
     """What a scenario says of one division."""
 
@@ -67,11 +65,11 @@ def headline(rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]] | None 
         tied: Gains over plain fine-tuning at settings that tuning rated as highly as the chosen one, by
             method: a gain is certain if they are, too.
     """
-    competing = [row for row in rows if row.division in METHODS]
-    baseline = next((row for row in competing if row.method == BASELINE), None)
-    others = [row for row in competing if row.method != BASELINE]
+    members = competing(rows)
+    baseline = next((row for row in members if row.method == BASELINE), None)
+    others = [row for row in members if row.method != BASELINE]
     if baseline is None:
-        return f"{counted(len(competing), 'method')}, not yet compared with plain fine-tuning."
+        return f"{counted(len(members), 'method')}, not yet compared with plain fine-tuning."
     if not others:
         value = number_text(baseline.estimates[RANKED_BY].value, ".2f", MISSING)
         return f"Plain fine-tuning ends with a final average of {value}. No other method has run here."
@@ -86,7 +84,7 @@ def headline(rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]] | None 
         for row in others
         if gains.get(row.method, 0.0) > 0 and is_certain_over((tied or {}).get(row.method, ()))
     ]
-    if not apart and all(len(row.seeds) == 1 for row in competing):
+    if not apart and all(len(row.seeds) == 1 for row in members):
         methods = "the one other method cannot" if len(others) == 1 else "no method can"
         return (
             f"One seed: {methods} be told apart from plain fine-tuning. The intervals cover episodes alone."
@@ -140,14 +138,14 @@ def verdicts(rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]] | None 
         leader = known[0]
         found.append(
             Verdict(
-                DIVISIONS.index(division),
-                division,
-                RULES[division],
-                leader,
-                _standing(leader, rows),
-                _doubt(leader, rows, apart, (tied or {}).get(leader.method, ())),
-                _keeping(known, baseline),
-                tuple(_facts(leader, baseline)),
+                division_number=DIVISIONS.index(division),
+                name=division,
+                rule=RULES[division],
+                leader=leader,
+                standing=_standing(leader, rows),
+                doubt=_doubt(leader, rows, apart, (tied or {}).get(leader.method, ())),
+                keeping=_keeping(known, baseline),
+                facts=tuple(_facts(leader, baseline)),
             )
         )
     return found

@@ -15,7 +15,16 @@ from clbench.spec.references import BASELINE
 from ...board.frontier import Curve, TiedGain
 from ...board.paths import SCENARIO
 from ...board.rows import Board, Row
-from ...board.summary import DIVISIONS, ELSEWHERE, GAIN, METHODS, RANKED_BY, divisions_of, tables_of
+from ...board.summary import (
+    DIVISIONS,
+    ELSEWHERE,
+    GAIN,
+    METHODS,
+    RANKED_BY,
+    competing,
+    divisions_of,
+    tables_of,
+)
 from ...board.tiers import TIERS
 from ...policies.compared import Comparison, Comparisons
 from ...policies.decoders import Decoding, read_decoding
@@ -30,7 +39,7 @@ FEWEST = 4
 """Fewest competing methods whose ranks under each definition are worth a table."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ScenarioView:
     """A scenario and its rows."""
 
@@ -192,8 +201,8 @@ def sorted_tables(board: Board) -> dict[str, list[Row]]:
     found = tables_of(board.rows)
 
     def place(name: str) -> tuple[bool, bool, int, str]:
-        competing = sum(row.division in METHODS for row in found[name])
-        return table_parts(name)[0] != SCENARIO, not found[name][0].to_criterion, -competing, name
+        rows = found[name]
+        return table_parts(name)[0] != SCENARIO, not rows[0].to_criterion, -len(competing(rows)), name
 
     return {name: found[name] for name in sorted(found, key=place)}
 
@@ -212,24 +221,23 @@ def scenarios(tables: Mapping[str, list[Row]], board: Board, comparisons: Compar
         layout, published = rows[0].runs[0].scores.layout, rows[0].runs[0].published
         groups = {"retained": layout.retained, "target": published.target, "held out": layout.held_out}
         tasks = {**groups, "target": places(rows[0])}
-        views = [row_view(row, rows) for row in rows]
-        competing = [row for row in rows if row.division in METHODS]
+        members = competing(rows)
         found.append(
             ScenarioView(
-                scenario,
-                _printable(groups),
-                _printable(tasks),
-                published.balanced,
-                layout.steps,
-                tuple(views),
-                tuple(families(competing)) if len(competing) >= FEWEST else (),
-                board.frontiers.get(scenario, ()),
-                board.tied.get(scenario, {}),
-                start_text(board.starts.get(scenario)),
-                unpaired_text(board.unpaired.get(scenario)),
-                agreement_text(board.agreements.get(scenario)),
-                comparisons.get(scenario, ()),
-                decoding if decoding and scenario == decoding.table else None,
+                id=scenario,
+                groups=_printable(groups),
+                tasks=_printable(tasks),
+                balanced=published.balanced,
+                steps=layout.steps,
+                rows=tuple(row_view(row, rows) for row in rows),
+                families=tuple(families(members)) if len(members) >= FEWEST else (),
+                frontier=board.frontiers.get(scenario, ()),
+                tied=board.tied.get(scenario, {}),
+                start=start_text(board.starts.get(scenario)),
+                unpaired=unpaired_text(board.unpaired.get(scenario)),
+                agreement=agreement_text(board.agreements.get(scenario)),
+                comparisons=comparisons.get(scenario, ()),
+                decoding=decoding if decoding and scenario == decoding.table else None,
             )
         )
     return found

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from clbench.scoring.intervals import Estimate
 
-from ....board.summary import METHODS, RowSummary
+from ....board.summary import RowSummary, competing
 from ...format import bytes_text, format_interval, times_text
 from .vega import Spec, finite, rounded
 
@@ -81,7 +81,7 @@ class Axis:
     @classmethod
     def of(cls, quantity: Quantity, rows: Sequence[RowSummary]) -> Axis:
         """Return the axis that has room for all values of the methods among `rows`, with their intervals."""
-        found = [quantity.of(row) for row in rows if row.division in METHODS]
+        found = [quantity.of(row) for row in competing(rows)]
         ends = [end for one in found for end in (one.value, one.low, one.high) if end is not None]
         least, most = min(ends, default=0.0), max(ends, default=1.0)
         if not quantity.is_cost:
