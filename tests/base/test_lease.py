@@ -146,7 +146,12 @@ def test_a_wrong_clock_of_this_machine_ends_no_lease(tmp_path: Path, monkeypatch
 
 def test_a_process_that_waits_for_a_lease_says_for_whom(tmp_path: Path, other: subprocess.Popen[str]) -> None:
     said: list[tuple[str, str]] = []
-    timer = threading.Timer(1.0, lambda: (other.kill(), other.wait()))
+
+    def die() -> None:
+        other.kill()
+        other.wait()
+
+    timer = threading.Timer(1.0, die)
     timer.start()
     listen(lambda place, text: said.append((place, text)))
     try:

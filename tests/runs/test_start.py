@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 from tiny import TINY
+from torch import Tensor
 
 from clbench.base.cache import cache_folder, cached
 from clbench.base.lease import Lease
@@ -85,7 +86,10 @@ class Still(Method):
     """A method whose policy does nothing, though its weights are those of the pretrained one."""
 
     def prepare(self, policy: Policy, prior: Any) -> None:
-        policy.act = lambda state, words, noise, image: torch.zeros_like(noise)  # type: ignore[method-assign]
+        def stay(state: Tensor, words: Tensor, noise: Tensor, image: Tensor | None = None) -> Tensor:
+            return torch.zeros_like(noise)
+
+        policy.act = stay  # type: ignore[method-assign]
 
 
 @pytest.mark.long
