@@ -260,7 +260,7 @@ def test_the_state_of_a_method_is_counted_in_bytes(
     tmp_path: Path, stranger: Callable[[type[Method]], str]
 ) -> None:
     record = execute(RunSpec(TOY, stranger(Counting), seed=0), tmp_path)
-    assert record.costs.bytes_kept == 4 * 4  # the anchor: four float32
+    assert record.costs.bytes_kept == 4 * 4 + 8  # the anchor, four float32, and the number of steps
     assert record.diagnostics == {"0": {"steps": 0}, "1": {"steps": 60}, "2": {"steps": 120}}
     replay = execute(RunSpec(TOY, "experience_replay", seed=0, targets=1), tmp_path)
     assert (replay.costs.bytes_kept or 0) > 10_000
