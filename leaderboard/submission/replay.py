@@ -56,14 +56,14 @@ def replay(subject: Subject, progress: ProgressCallback) -> list[Check]:
         check_device(spec.device)
     except InputError as error:  # the rest needs the device of the run
         return [Check("policies", str(error), None)]
-    theirs, ours = (_instructions(made) for made in (run.record.fingerprint, subject.here))
+    theirs, ours = (_processor(made) for made in (run.record.fingerprint, subject.here))
     # the shipped policy of seed 0 is the same on all processors, but training it further is not
-    another_processor = theirs not in (None, ours)
+    another_processor = any(one not in (None, here) for one, here in zip(theirs, ours, strict=True))
     if another_processor or not _same_pretraining(subject):
+        made, here = (" with ".join(one or "unknown" for one in both) for both in (theirs, ours))
         result = (
             f"{'training' if another_processor else 'pretraining'} does not give the same policy here as on "
-            f"the machine of the record (instructions of its processor: {theirs}, here: {ours}): repeat it "
-            "on one like that"
+            f"the machine of the record (its processor: {made}, here: {here}): repeat it on one like that"
         )
         return [Check("policies", result, None)]
     kept = kept_stages(subject.resolved, subject.request.checkpoints)
@@ -84,10 +84,17 @@ def replay(subject: Subject, progress: ProgressCallback) -> list[Check]:
     return checks
 
 
-def _instructions(made: dict[str, Any]) -> Any:
-    """Return the instructions of the processor in a fingerprint, None if it does not have them."""
+def _processor(made: dict[str, Any]) -> tuple[str | None, str | None]:
+    """Return the maker and the instructions of the processor in a fingerprint, None where it lacks one.
+
+    The maker is the first word of the model. MKL has other code for Intel's processors than for others with
+    the same instructions.
+    """
     hardware = made.get("hardware")
-    return hardware.get("instructions") if isinstance(hardware, dict) else None
+    values = hardware if isinstance(hardware, dict) else {}
+    model, instructions = (values.get(name) for name in ("processor", "instructions"))
+    maker = model.split()[0] if isinstance(model, str) and model.strip() else None
+    return maker, instructions if isinstance(instructions, str) else None
 
 
 def _same_pretraining(subject: Subject) -> bool:

@@ -82,6 +82,11 @@ def repeat_row(values: dict[str, Any]) -> None:
         column.append(column[-1])
 
 
+def rename_processor(values: dict[str, Any]) -> None:
+    hardware = values["fingerprint"]["hardware"]
+    hardware["processor"] = f"{hardware['processor'].partition(' ')[0]} Abacus"
+
+
 FORGERIES = {
     # ---- the record alone, or beside the installed code
     "a failure that ends before the horizon": Forgery(
@@ -174,10 +179,13 @@ FORGERIES = {
         "replayed", "pretraining does not give the same policy", set_in("fingerprint", pretrained="0" * 16)
     ),
     "other instructions of the processor": Forgery(
+        "replayed", " with NEON, here: ", set_in("fingerprint.hardware", instructions="NEON")
+    ),
+    "another maker of the processor": Forgery(
         "replayed",
-        "policies: training does not give the same policy here as on the machine of the record (instructions "
-        "of its processor: NEON, here: ",
-        set_in("fingerprint.hardware", instructions="NEON"),
+        "policies: training does not give the same policy here as on the machine of the record (its "
+        "processor: Abacus with ",
+        set_in("fingerprint.hardware", processor="Abacus 9000"),
     ),
     # ---- what only the whole run says
     "a success on the way": Forgery(
@@ -216,7 +224,7 @@ FORGERIES = {
     # ---- what no repetition can see: the reasons are in docs/guide/security.md
     "another commit": Forgery(None, "", set_in("fingerprint.commit", id="0" * 40)),
     "another version of Python": Forgery(None, "", set_in("fingerprint", python="3.12.0")),
-    "another processor": Forgery(None, "", set_in("fingerprint.hardware", processor="Abacus")),
+    "another processor of the same maker": Forgery(None, "", rename_processor),
     "another time of day": Forgery(None, "", set_in("timing", started="2001-01-01T00:00:00+00:00")),
     "a faster run": Forgery(None, "", set_in("timing", seconds=0.01)),
     "no success rules": Forgery(
