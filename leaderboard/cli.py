@@ -171,13 +171,14 @@ def submit(
         scenario: Gymnasium id of the scenario, for example clbench/Fetch-v1; module:id imports the module
             first.
         seeds: Number of seeds.
-        first_seed: The first seed.
+        first_seed: The first seed. No board shows seeds from 100 on, which are for tuning.
         order: Order of the targets, for scenarios with one published order: 0 is that order, other numbers
             are permutations. Only order 0 makes rows. Scenarios with a separate order for each seed, such
             as Fetch-v1, accept only 0.
-        workers: Number of runs at once, each a process with one thread (default: all cores).
+        workers: Number of runs at once, each a process with one thread (default: all cores; with --device
+            cuda, all GPUs).
         records: Folder of the records.
-        device: Device that runs the policies, for example cpu or cuda.
+        device: Device that runs the policies, for example cpu or cuda, which gives each run one of the GPUs.
         checkpoints: Keep the policies of all stages below this folder, so that `clbench verify` need not make
             them again.
     """
@@ -244,7 +245,8 @@ def verify(
         checkpoints: Folder of policies from `clbench run --checkpoints` (default: train them again).
         pretrain: At the tier retrained, also repeat the pretraining (default: use the cached policy).
         by: Your name, for the file (default: none).
-        workers: Number of verifications at once, each a process with one thread (default: all cores).
+        workers: Number of verifications at once, each a process with one thread (default: all cores; for
+            records of cuda, all GPUs).
         records: Folder of the records.
         as_json: Print a JSON list that states for each record whether it passed, its tier, checks and
             failure.

@@ -11,8 +11,9 @@ from clbench.base.errors import InputError
 from clbench.jobs.grid import name_of, run_specs
 from clbench.records.paths import RECORDS
 from clbench.runs.spec import RunSpec
+from clbench.spec.fields import is_whole
 from clbench.spec.policies import DEFAULT_POLICY
-from clbench.spec.protocol import DEFAULT_SEEDS
+from clbench.spec.protocol import DEFAULT_SEEDS, FIRST_TUNING_SEED
 from clbench.spec.references import BASELINE
 
 from .board.rows import compute_board
@@ -45,10 +46,11 @@ def compare(
         methods: One method or several: classes, installed names, or "module:Class". Classes of a notebook run
             one after the other, see `clbench.run`.
         seeds: Number of seeds.
-        first_seed: The first seed.
+        first_seed: The first seed, below 100: no board shows the seeds for tuning.
         policy: Name of the policy, such as "discrete_diffusion", "flow-base" or "module:Class".
         records: Folder of the records. Those of other methods are not read.
-        workers: Number of runs at once, each a process with one thread; all cores if None.
+        workers: Number of runs at once, each a process with one thread; all cores if None, or all
+            GPUs with the device "cuda".
         device: Device that runs the policies, for example "cpu" or "cuda".
 
     Returns:
@@ -60,6 +62,10 @@ def compare(
         InputError: A value cannot be used, or a record makes no row; the message says why.
         RunsFailedError: A run failed.
     """
+    if is_whole(first_seed) and first_seed >= FIRST_TUNING_SEED:
+        raise InputError(
+            f"first_seed must be below {FIRST_TUNING_SEED}, not {first_seed}: the others are for tuning."
+        )
     several = [methods] if isinstance(methods, str | type) else methods
     names = dict.fromkeys([BASELINE, *map(name_of, several)])
     firsts = [RunSpec(scenario, name, first_seed, device=device, policy=policy) for name in names]

@@ -154,12 +154,11 @@ class Lease:
         if found is not None:
             return found.token != self._lock.token
         try:
-            self._file.lstat()
+            return self._file.lstat().st_size == 0  # a new owner's, whose content has not arrived
         except FileNotFoundError:  # whoever takes it over may be about to write its own
             return True
         except OSError:  # the heartbeat decides whether the folder fails for too long
             return False
-        return False
 
     def release(self) -> None:
         """Give the lease back, if this process has it."""

@@ -76,7 +76,7 @@ def run(
         methods: Names of installed methods, or module:Class; at least one, or --all.
         every: Run all installed methods.
         seeds: Number of seeds.
-        first_seed: The first seed.
+        first_seed: The first seed. No board shows seeds from 100 on, which are for tuning.
         order: Order of the targets, for scenarios with one published order: 0 is that order, other numbers
             are permutations. The leaderboard uses them to report how much scores depend on the order.
             Scenarios with a separate order for each seed, such as Fetch-v1, accept only 0.
@@ -289,7 +289,7 @@ def _workers(count: int | None, ray: str | None, device: str) -> Workers:
 
 
 def _print_forecast(
-    runs: Sequence[ResolvedRun], records: Path, workers: int | None, checkpoints: Path | None
+    runs: Sequence[ResolvedRun], records: Path, workers: int, checkpoints: Path | None
 ) -> None:
     """Print what the runs without a record would take."""
     from clbench.jobs.forecast import forecast

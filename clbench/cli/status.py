@@ -264,8 +264,8 @@ def _values(state: RunState, records: Path) -> dict[str, Any]:
     return {
         "run": state.path.relative_to(records).with_suffix("").as_posix(),
         "state": state.state,
-        "process": None if state.owner is None else state.owner.process,
-        "host": None if state.owner is None else state.owner.host,
+        "process": None if state.owner is None else state.owner.process or None,
+        "host": None if state.owner is None else state.owner.host or None,
         "share": None if state.progress is None else round(state.progress.share, 3),
         "seconds": state.seconds if state.progress is None else round(state.progress.seconds, 1),
         "seconds_left": None if state.seconds_left is None else round(state.seconds_left, 1),

@@ -126,7 +126,8 @@ def play_in_lanes(
         enough: Called with each outcome; once it returns True, only the episodes that have ended count.
 
     Raises:
-        LeakError: A hook asks for other episodes than validation episodes of tasks that it knows.
+        LeakError: A hook asks for other episodes than validation episodes of tasks whose
+            demonstrations it may read.
     """
     check_episodes((task.name, split) for task, split, _ in trials)
     queue, idle = list(reversed(trials)), list(range(lanes.count))

@@ -61,7 +61,8 @@ class Evaluator:
             progress: Called with the number of episodes that have ended since its last call.
 
         Raises:
-            LeakError: A hook asks for other episodes than validation episodes of tasks that it knows.
+            LeakError: A hook asks for other episodes than validation episodes of tasks whose
+                demonstrations it may read.
         """
         numbers = range(self.scenario.budget.episodes(split))
         return self.play(
@@ -87,7 +88,8 @@ class Evaluator:
             enough: Called with each outcome; once it returns True, only the episodes that have ended count.
 
         Raises:
-            LeakError: A hook asks for other episodes than validation episodes of tasks that it knows.
+            LeakError: A hook asks for other episodes than validation episodes of tasks whose
+                demonstrations it may read.
         """
         with evaluating(policy):
             return play_in_lanes(

@@ -22,7 +22,6 @@ from clbench.policy.kinds import new_policy
 from clbench.runs.spec import ResolvedRun
 from clbench.spec.language import encode
 from clbench.spec.scenario import Scenario
-from clbench.worlds.threads import cores
 
 STEPS = 8
 """Optimiser steps that are timed."""
@@ -41,15 +40,13 @@ KINDS = {
 """What one job does, and what several do, in words. A plan does not know which data are in the cache."""
 
 
-def forecast(
-    plan: Plan, runs: Sequence[ResolvedRun], workers: int | None, checkpoints: Path | None
-) -> list[str]:
+def forecast(plan: Plan, runs: Sequence[ResolvedRun], workers: int, checkpoints: Path | None) -> list[str]:
     """Return lines that say what a plan would do on this machine.
 
     Args:
         plan: The plan of the runs.
         runs: The runs, of one scenario or of several.
-        workers: Number of jobs at once; None for all cores.
+        workers: Number of jobs at once.
         checkpoints: Folder that would keep the policies of all stages, or None.
     """
     counts = Counter(KINDS[job.function] for job in plan.jobs)
@@ -57,7 +54,7 @@ def forecast(
     to_do = ", ".join(counted(count, *words) for words, count in counts.items())
     return [
         f"To do: {to_do}.",
-        _time(plan.jobs, list(scenarios.values()), workers or cores()),
+        _time(plan.jobs, list(scenarios.values()), workers),
         _disk(plan.jobs, runs, scenarios, checkpoints),
     ]
 

@@ -197,7 +197,7 @@ def run(
         scenario: Gymnasium id of the scenario; "module:id" imports the module first.
         method: Class of the method, its installed name, or "module:Class".
         seeds: Number of seeds.
-        first_seed: The first seed.
+        first_seed: The first seed. No board shows seeds from 100 on, which are for tuning.
         settings: Hyper-parameters that differ from the method's own, or from those tuned for the scenario.
         policy: Name of the policy, such as "discrete_diffusion", "flow-base" or "module:Class".
         perturb: Whether the skills and each new target are also evaluated in perturbed worlds.

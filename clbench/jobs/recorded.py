@@ -22,7 +22,8 @@ def has_record(run: ResolvedRun, records: Path) -> bool:
     """Return whether exactly this run has completed, or the same run with perturbed episodes.
 
     A record does not count if its run failed, if it cannot be read or contradicts itself, if its budget,
-    device or settings differ, or if the code of a method or policy "module:Class" has changed since.
+    device or settings differ, or if the version of the method, or the code of a method or policy
+    "module:Class", has changed since.
 
     Raises:
         InputError: The record was made with another definition of the scenario.

@@ -159,6 +159,8 @@ def _clip(trained: list[nn.Parameter], step: int) -> None:
     try:
         nn.utils.clip_grad_norm_(trained, GRADIENT_NORM, error_if_nonfinite=True)
     except RuntimeError as error:
+        if type(error) is not RuntimeError:  # the GPU, or its memory: this line is the first to wait for it
+            raise
         raise GradientError(f"step {step}: a gradient is not finite.") from error
 
 

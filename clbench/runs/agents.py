@@ -89,7 +89,7 @@ def evaluate_agent(
         records: Folder of the records.
 
     Returns:
-        The record so far. Base no choice on test episodes: choose with a seed from 100 on.
+        The record so far. Base no choice on test episodes; choose with a seed from 100 on.
 
     Raises:
         WrongTypeError: `env` is not an environment of a scenario, or `agent` cannot act.
@@ -297,7 +297,7 @@ class StagedRun:
                 if (owner := lease.owner) is not None:
                     told = f"{self} belongs to {owner}, which is evaluating its stages"
                     raise InputError(f"{told}: choose another name or seed, or wait until it has ended.")
-                time.sleep(0.1)  # the lease of a dead process on another machine is watched for a while
+                time.sleep(1.0)  # the lease of a dead process on another machine is watched for a while
             _LEASES[self.unfinished] = lease
         _LEASES[self.unfinished].check()
 

@@ -111,7 +111,7 @@ def score(
         progress: Called with the share of the stage's episodes that have ended since its last call.
 
     Returns:
-        The record so far. Base no choice on test episodes: choose with a seed from 100 on.
+        The record so far. Base no choice on test episodes; choose with a seed from 100 on.
 
     Raises:
         InputError: Another stage comes next, a record exists already, `executed` is not that of stage 0, the

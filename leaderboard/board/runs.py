@@ -203,7 +203,7 @@ def _check_kind(run: RunInfo, changed: bool | None) -> None:
             raise RecordError("it is a tuning run: settings may have been chosen on its episodes.")
     elif run.seed >= FIRST_TUNING_SEED:
         raise RecordError(
-            f"seeds from {FIRST_TUNING_SEED} are for tuning: settings may be chosen on its episodes."
+            f"seeds from {FIRST_TUNING_SEED} are for tuning: settings may be chosen on their episodes."
         )
     if changed is False and run.changes:
         raise RecordError(f"settings were changed: {', '.join(run.changes)}.")

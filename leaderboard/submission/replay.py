@@ -224,7 +224,7 @@ def _distance(one: Policy, other: Policy) -> float:
     """Return the distance between the weights and buffers that two policies have in common."""
     values = one.state_dict()
     common = [(values[name], value) for name, value in other.state_dict().items() if name in values]
-    return math.hypot(*(float((value - same).float().norm()) for same, value in common))
+    return math.hypot(*(float((value.float() - same.float()).norm()) for same, value in common))
 
 
 def _outcome(row: EpisodeRow) -> str:

@@ -37,7 +37,7 @@ def run_submission(
     Args:
         runs: Runs of one method.
         records: Folder of the records.
-        workers: Number of runs at once; None for all cores.
+        workers: Number of runs at once; None for all cores, or all GPUs.
         checkpoints: Folder below which the policies of all stages are kept; None keeps none.
 
     Returns:

@@ -359,7 +359,8 @@ def run_verifications(
     with tempfile.TemporaryDirectory() as folder:
         reports = {path: Path(folder) / f"{number}.json" for number, path in enumerate(paths)}
         jobs = {path: _job(path, records, request, report) for path, report in reports.items()}
-        failed = run_with_bars([*jobs.values()], Processes(workers), console)
+        device = "cuda" if any(job.device == "cuda" for job in jobs.values()) else "cpu"
+        failed = run_with_bars([*jobs.values()], Processes(workers, device), console)
         return [Verification(path, _read(reports[path]), failed.get(job)) for path, job in jobs.items()]
 
 
@@ -369,12 +370,13 @@ def _read(report: Path) -> list[dict[str, Any]]:
 
 
 def _job(path: Path, records: Path, request: Request, report: Path) -> Job:
-    """Return the job that verifies a record; its length is known if the record can be read."""
-    length = 1.0
+    """Return the job that verifies a record; its length and device are known if the record can be read."""
+    length, device = 1.0, "cpu"
     try:
         subject = Subject(read_run(records, path, changed=None), request)
         scenario = subject.scenario
         if request.tier != "recomputed":
+            device = subject.spec.device
             length += len(scenario.target) * scenario.budget.adaptation_steps
         if request.tier == "retrained":
             length += run_length(scenario, subject.protocol)
@@ -382,7 +384,7 @@ def _job(path: Path, records: Path, request: Request, report: Path) -> Job:
     except ClbenchError:
         pass  # the job itself reports the error
     arguments = {"path": path, "records": records, "request": request, "report": report}
-    return Job(str(path), verify_job, arguments, length)
+    return Job(str(path), verify_job, arguments, length, device=device)
 
 
 def verify_job(path: Path, records: Path, request: Request, report: Path, progress: ProgressCallback) -> str:

@@ -109,7 +109,8 @@ def terminal(table: Summary, width: int = 108, sort: str | None = None) -> Rende
     if over_scenarios:
         parts += [*_fitted("All scenarios", over_scenarios, _overall_heads(over_scenarios), width), Text()]
     if parts:
-        heads = [one for rows in tables for one in fitting(rows) if one.metric.higher_is_better is False]
+        columns = [one for rows in tables for one in _columns(rows, sort)]
+        heads = [one for one in columns if one.metric.higher_is_better is False]
         names = listed([*dict.fromkeys(one.title for one in heads), "cost", "bytes kept"])
         tried = TRIED if any(row.to_criterion for row in table.rows) else ""
         tiers = ", ".join(f"{number} {tier}" for number, tier in enumerate(TIERS))
@@ -215,11 +216,16 @@ def _overall_heads(rows: Sequence[OverallRow]) -> list[_Head]:
     return [letters, *_metric_heads(rows)]
 
 
-def _metric_heads(rows: Rows, sort: str | None = None) -> list[_Head]:
-    """Return the columns of the metrics that fit, and of the one that the rows are sorted by."""
+def _columns(rows: Rows, sort: str | None) -> list[Column]:
+    """Return the metrics that fit, and the one that the rows are sorted by."""
     columns = list(fitting(rows))
     if sort is not None and sort not in {column.metric.name for column in columns}:
         columns.append(Column(METRICS[sort], column_title(sort, rows[0].to_criterion)))
+    return columns
+
+
+def _metric_heads(rows: Rows, sort: str | None = None) -> list[_Head]:
+    """Return the columns of these metrics."""
 
     def head(column: Column) -> _Head:
         name = column.metric.name
@@ -231,7 +237,7 @@ def _metric_heads(rows: Rows, sort: str | None = None) -> list[_Head]:
             stays=name == sort,
         )
 
-    return [head(column) for column in columns]
+    return [head(column) for column in _columns(rows, sort)]
 
 
 def _size(row: RowSummary) -> str:

@@ -138,6 +138,15 @@ def test_a_lease_whose_content_has_not_arrived_has_an_unknown_owner(tmp_path: Pa
     assert lease.owner is None
 
 
+def test_an_owner_notices_the_lease_of_another_one_whose_content_has_not_arrived(tmp_path: Path) -> None:
+    lease = Lease(tmp_path / "x")
+    assert lease.take()
+    lease_path(tmp_path / "x").unlink()
+    lease_path(tmp_path / "x").touch()
+    with pytest.raises(LeaseLostError):
+        lease.check()
+
+
 def test_a_wrong_clock_of_this_machine_ends_no_lease(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _from_elsewhere(tmp_path / "x")
     monkeypatch.setattr(time, "time", lambda: 10.0**10)

@@ -53,6 +53,18 @@ def test_stages_to_a_criterion_warm_up_in_fifteen_steps_and_then_keep_their_rate
     assert [warm_up(step) for step in range(20)] == pytest.approx([*np.arange(1, 16) / 15, *[1.0] * 5])
 
 
+def test_memory_that_runs_out_while_gradients_are_clipped_is_no_gradient_that_is_not_finite(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def run_out(*_: object, **__: object) -> None:
+        raise torch.OutOfMemoryError("the GPU is full")
+
+    monkeypatch.setattr(nn.utils, "clip_grad_norm_", run_out)
+    weight = nn.Parameter(torch.zeros(4))
+    with pytest.raises(torch.OutOfMemoryError, match="the GPU is full"):
+        optimise([weight], 0.1, 1, lambda _: weight.sum())
+
+
 def test_gradients_are_clipped_after_the_method_has_set_them() -> None:
     weight = nn.Parameter(torch.zeros(4))
     seen: list[float] = []

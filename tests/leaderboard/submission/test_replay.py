@@ -1,19 +1,24 @@
 """Replaying: the policies that a run kept must begin where pretraining ends."""
 
+import dataclasses
 import hashlib
 import importlib
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from eager import EAGER
 from safetensors.torch import load_file, save_file
 from verification import TOY, edit, failures, verify
 
 from clbench.base.cache import MANIFEST, cached
 from clbench.evaluation.rollouts import Evaluator
+from clbench.learning.method import Method
+from clbench.policy.policy import Policy
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 
@@ -175,6 +180,29 @@ def test_a_test_run_with_a_tuning_seed_is_refused(tmp_path: Path) -> None:
     execute(spec, tmp_path / "records")
     path = spec.path(tmp_path / "records")
     assert "seeds from 100 are for tuning" in failures(verify(path, "recomputed"))
+
+
+@dataclasses.dataclass
+class Masking(Method):
+    """Keeps a mask in a buffer of the policy, as methods that prune do."""
+
+    def prepare(self, policy: Policy, prior: Any) -> None:
+        policy.register_buffer("mask", torch.ones(3, dtype=torch.bool))
+
+    def load_state(self, policy: Policy, state: Any) -> None:
+        self.prepare(policy, None)
+
+
+@pytest.mark.long
+def test_kept_policies_with_a_mask_are_compared(
+    tmp_path: Path, stranger: Callable[[type[Method]], str]
+) -> None:
+    spec = RunSpec(TOY, stranger(Masking), 0)
+    execute(spec, tmp_path / "records", checkpoints=tmp_path / "checkpoints")
+    path = spec.path(tmp_path / "records")
+    checks = verify(path, "replayed", tmp_path, method=spec.method)
+    assert failures(checks) == ""
+    assert "from stage to stage" in {check.name for check in checks}
 
 
 @pytest.mark.slow

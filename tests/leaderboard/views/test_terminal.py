@@ -83,16 +83,19 @@ def test_one_scenario_is_shown_in_the_order_of_a_metric(
     assert order == {"adaptation": False, "retention": True}
 
 
-@pytest.mark.parametrize("metric", ["forgetting", "kept_share"])
+@pytest.mark.parametrize("metric", ["forgetting", "kept_share", "activation_drift"])
 def test_a_narrow_terminal_keeps_the_column_that_it_is_sorted_by(
     metric: str, four_methods: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "40")
     arguments = ["leaderboard", "clbench/Toy-v0", "--records", str(four_methods)]
-    heads = []
+    heads, legends = [], []
     for sort in ([], ["--sort", metric]):
         app([*arguments, *sort], result_action="return_value")
-        heads.append(capsys.readouterr().out.partition("Too wide")[0].split())
+        head, _, legend = capsys.readouterr().out.partition("Too wide")
+        heads.append(head.split())
+        legends.append(" ".join(legend.split()))
+    assert ("activation drift" in legends[1]) == (metric == "activation_drift")  # where lower is better
     words = metric.split("_")
     assert not set(words) & set(heads[0])
     assert set(words) <= set(heads[1])
