@@ -41,7 +41,7 @@ def test_a_method_whose_record_makes_no_row_is_named_with_the_reason(tmp_path: P
 
 def test_an_unknown_method_is_named_before_anything_runs(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="first_seed must be below 100, not 100: the others are for tuning"):
-        compare(TOY, "frozen", first_seed=100)
+        clbench.compare(TOY, "frozen", first_seed=100, records=tmp_path)
     with pytest.raises(UnknownNameError, match="Did you mean 'frozen'"):
         clbench.compare(TOY, "frosen", records=tmp_path)
     with pytest.raises(UnknownNameError, match="Did you mean 'my_method:Mine'"):
