@@ -215,7 +215,7 @@ def _go_on(subject: Subject, kept: Path, policies: Sequence[Policy]) -> Check:
         "from stage to stage",
         f"stage {number} of {count} ({run.scenario.target[number - 1].name}) moved the kept policy by "
         f"{moved:.3g}; trained again, it ends {apart:.2g} away from there; one made-up policy would be found "
-        f"with a probability of {1 / count:.0%}",
+        f"with a probability of at least {1 / count:.0%}",
         same_parts and apart <= LARGEST_DRIFT * moved,
     )
 
