@@ -20,11 +20,12 @@ def load_board(records: Path | str = RECORDS) -> pandas.DataFrame:
     "clbench/Fetch-v1+discrete_diffusion", because only rows of one policy are compared), `method`,
     `division`, `letters` (two rows of a division share one if they are not told apart in final
     average), `tier`, `seeds` (their number); for every metric its value and the ends of its 95 % confidence
-    interval, for example `retention`, `retention_low`, `retention_high`; then `relative_cost` (training time
-    relative to sft), `steps`, `bytes_kept`, `parameters`, `parameters_added` and `environment_steps` (of
-    agents that learned online), each a mean over seeds; `order_sensitivity` (range of the final average over
-    three or more orders of the targets); and `settings_tried` (number of settings that tuning tried). Missing
-    values are NaN. `clbench leaderboard` lists the records that make no row, with the reason.
+    interval, for example `retention`, `retention_low`, `retention_high`; then `relative_cost` (time of all
+    optimiser steps relative to sft), `steps`, `bytes_kept`, `parameters`, `parameters_added` and
+    `environment_steps` (of agents that learned online), each a mean over seeds; `order_sensitivity` (range
+    of the final average over three or more orders of the targets); and `settings_tried` (number of settings
+    that tuning tried). Missing values are NaN. `clbench leaderboard` lists the records that make no row,
+    with the reason.
 
     Args:
         records: Folder of the records.

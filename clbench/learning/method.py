@@ -143,6 +143,9 @@ class Method:
     def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter] | list[dict[str, Any]]:
         """Return the parameters to train on this target, or optimiser groups of them.
 
+        Where a criterion ends the stage, it takes no optimiser steps: only the steps of the loop are checked
+        against the criterion.
+
         Args:
             policy: Policy to train.
             stage: The target and its data, open until the end of `end_task`.

@@ -52,11 +52,13 @@ class Quantity:
 
 
 LEARNED = Quantity("learned", "adaptation", "success on each new task right after learning it")
-COST = Quantity("relative cost", "relative_cost", "training time divided by sft's", is_cost=True)
+COST = Quantity(
+    "relative cost", "relative_cost", "time of all optimiser steps divided by sft's", is_cost=True
+)
 BYTES = Quantity(
     "bytes kept",
     "bytes_kept",
-    "data, weights or statistics passed between stages",
+    "state, added buffers and prior data kept between stages",
     is_cost=True,
 )
 KEPT = Quantity("kept", "kept", "success at the end on everything known before the last task")
