@@ -121,7 +121,7 @@ class CheckRow(NamedTuple):
 
 @dataclass
 class Relearning:
-    """How plain fine-tuning regained the retained skill most lost, after the last stage."""
+    """How plain fine-tuning regained the retained skill that succeeds least, after the last stage."""
 
     skill: str
     """Name of the skill: the one with the fewest successes, the first on a tie."""
@@ -263,8 +263,8 @@ class Record:
     checks: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in CHECK_COLUMNS})
     """Checks of the criterion, see `CHECK_COLUMNS`."""
     relearning: Relearning | None = None
-    """Relearning of the skill most lost. None if it was not measured: without a criterion or a retained
-    skill, in a tuning run, or where plain fine-tuning failed."""
+    """Relearning of the skill that succeeds least. None if it was not measured: without a criterion or a
+    retained skill, in a tuning run, or where plain fine-tuning failed."""
     costs: Costs = field(default_factory=Costs)
     """What the run cost."""
     diagnostics: dict[str, Any] = field(default_factory=dict)

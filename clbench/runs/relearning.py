@@ -1,4 +1,4 @@
-"""Relearning: how fast plain fine-tuning regains the retained skill that a run has lost most.
+"""Relearning: how fast plain fine-tuning regains the retained skill that succeeds least.
 
 A skill that comes back within a few steps was hidden rather than lost. All methods are measured alike: a copy
 of the final policy is fine-tuned with all its parameters, adapters included, at the scenario's learning rate,
@@ -29,7 +29,7 @@ from clbench.spec.task import Task
 def relearn(
     trainer: Trainer, examiner: Examiner, checker: Checker, progress: ProgressCallback
 ) -> Relearning | None:
-    """Relearn the skill most lost, and return the outcome; None if plain fine-tuning fails on the policy.
+    """Relearn the skill that succeeds least; return the outcome, None if plain fine-tuning fails.
 
     The skill is the one with the fewest successes in its validation episodes, the first on a tie.
 

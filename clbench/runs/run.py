@@ -307,7 +307,7 @@ class _Run:
         self.record.timing["stages"].append({name: round(value, 2) for name, value in seconds.items()})
 
     def _relearn(self) -> None:
-        """Relearn the skill most lost; the policy, the method and the costs of the run stay as they are."""
+        """Relearn the skill that succeeds least; policy, method and costs of the run stay as they are."""
         begin = time.perf_counter()
         self.trainer.where = "relearning"
         self.record.relearning = relearn(self.trainer, self.examiner, self.checker, self.progress)

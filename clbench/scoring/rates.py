@@ -37,7 +37,7 @@ class Measured:
     met: Array
     """Whether each stage met its criterion, 0 or 1, (..., targets); NaN without a criterion."""
     relearning_steps: Array
-    """Optimiser steps to relearn the skill most lost, (...)."""
+    """Optimiser steps to relearn the skill that succeeds least, (...)."""
 
 
 def _arrays(cls: type[Measured]) -> tuple[str, ...]:

@@ -122,7 +122,7 @@ def read_checks(record: Record, protocol: Protocol) -> tuple[Array, Array]:
 
 
 def read_relearning(record: Record, protocol: Protocol) -> Array:
-    """Return the optimiser steps to relearn the skill most lost, (); NaN where it was not measured.
+    """Return the optimiser steps to relearn the skill that succeeds least, (); NaN if not measured.
 
     Raises:
         RecordError: The skill, the successes or the steps are impossible.

@@ -36,8 +36,8 @@ INTRODUCTION = (
     "intervals over seeds (docs/guide/statistics.md); differences and ratios are paired by seed and "
     "episode. Each verdict takes its intervals alone, without correction for the number of verdicts and "
     "controls: where a true value lies at the bar of a rule, one interval in 40 is wrongly beyond it. A rule "
-    "that holds by one of two arms is wrong up to twice as often, and its first figure is the larger of the "
-    "two; one that needs all its figures is wrong less often. A "
+    "that either of two arms can satisfy is wrong up to twice as often, and its first figure is the larger "
+    "of the two. A rule that needs all its figures is wrong less often. A "
     'rule that asks for an interval needs {seeds} seeds. "Cannot be shown here" means that a condition of '
     "the rule is missing, so that no figure speaks for or against the claim; a sentence says which. "
     "`consft` is the published loss. Its authors tune the first temperature and the length of the schedule "

@@ -119,7 +119,7 @@ def _replay(boards: dict[str, list[Row]], tied: Tied) -> Section:
     answers = []
     for name, rows in boards.items():
         baseline = next((row for row in rows if row.method == BASELINE), None)
-        usual = f"{format_interval(_steps(baseline), '.0f')}{_never_met(baseline)}" if baseline else MISSING
+        usual = f"; plain fine-tuning takes {_steps(baseline)}{_missed(baseline)}" if baseline else ""
         apart = apart_from_baseline(rows)
         for row in by_gain(rows):
             kept = row.costs.get("bytes_kept")
@@ -131,9 +131,8 @@ def _replay(boards: dict[str, list[Row]], tied: Tied) -> Section:
             doubt = "" if certain else ", which is not certain"
             answers.append(
                 f"On {name}, `{row.method}` {moves} {format_interval(gain)}{doubt}, keeps "
-                f"{megabytes(int(kept))} between stages, and takes "
-                f"{format_interval(_steps(row), '.0f')} steps to learn a target{_never_met(row)} (plain "
-                f"fine-tuning: {usual})."
+                f"{megabytes(int(kept))} between stages, and takes {_steps(row)} steps to learn a "
+                f"target{_missed(row)}{usual}."
             )
     if answers:
         answers += [WHAT_IS_KEPT, OWN_RATES]
@@ -147,18 +146,19 @@ WHAT_IS_KEPT = (
 
 OWN_RATES = (
     "Each method has the learning rate that tuning chose for it, and a smaller one takes more steps: a "
-    "difference in steps need not come from the demonstrations."
+    "difference in steps need not come from the demonstrations. A stage that misses the criterion counts "
+    "with all steps of the budget."
 )
 
 
-def _never_met(row: Row) -> str:
-    """Return the end of a number of steps, if some stages ended without the criterion."""
+def _missed(row: Row) -> str:
+    """Return what follows a number of steps, if some stages ended without the criterion."""
     met = row.estimates["criterion_met"].value
-    return "" if met is None or met == 1 else f", with {1 - met:.0%} of the stages not meeting the criterion"
+    return "" if met is None or met == 1 else f" ({1 - met:.0%} of its stages missed the criterion)"
 
 
-def _steps(row: Row) -> Estimate:
-    return row.estimates["steps_to_criterion"]
+def _steps(row: Row) -> str:
+    return format_interval(row.estimates["steps_to_criterion"], ".0f")
 
 
 def _learning_rates(board: Board, evidence: Callable[[str], Evidence]) -> Section:

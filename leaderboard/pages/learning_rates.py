@@ -94,8 +94,8 @@ def _at_the_first_rung(
         ]
         yield (
             f"On {name}, methods without prior demonstrations keep at {rate_text(factor)}: {listed}. The "
-            f"first of them, `{falling[0]}`, keeps {' and '.join(over)}; it was chosen as the best of "
-            f"{len(falling)} on the same episodes, and the rate as above."
+            f"first of them, `{falling[0]}`, keeps {' and '.join(over)}. This method, the best of "
+            f"{len(falling)}, and the rate of plain fine-tuning were both chosen on the same episodes."
         )
 
 

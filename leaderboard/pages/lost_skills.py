@@ -19,12 +19,12 @@ LOST = 0.5
 
 LOST_MEANS = (
     "A skill is lost here if the policy does it in fewer than half of its validation episodes after the last "
-    "target. Each run measures the skill that is lost most."
+    "target. Each run measures the skill that succeeds least."
 )
 
 
 def relearning_sentences(boards: Mapping[str, Sequence[Row]]) -> list[str]:
-    """Return how fast the skill most lost comes back, on each board where it was measured."""
+    """Return how fast the skill that succeeds least comes back, on each board where it was measured."""
     answers = []
     for name, rows in boards.items():
         by_method = {row.method: row for row in rows}
@@ -37,8 +37,8 @@ def relearning_sentences(boards: Mapping[str, Sequence[Row]]) -> list[str]:
             answers.append(f"On {name}, plain fine-tuning loses a skill in {len(lost)} of {seeds}.")
             continue
         answers.append(
-            f"On {name}, plain fine-tuning loses a skill in {len(lost)} of {seeds} (most lost: "
-            f"{_skills(lost)}). It meets the criterion again after {_steps(lost)} steps on its "
+            f"On {name}, plain fine-tuning loses a skill in {len(lost)} of {seeds} ({_skills(lost)}). "
+            f"It meets the criterion again after {_steps(lost)} steps on its "
             f"demonstrations{_never_again(lost)}."
             f"{_without_pretraining(by_method.get(FROM_SCRATCH), lost)}"
         )
@@ -50,7 +50,9 @@ def relearning_sentences(boards: Mapping[str, Sequence[Row]]) -> list[str]:
 def _never_again(lost: Sequence[Relearning]) -> str:
     """Return the end of a sentence on steps to relearn, if some runs ended without the criterion."""
     count = sum(not one.met for one in lost)
-    return f"; {count} of the {len(lost)} never did, and count with all steps of a stage" if count else ""
+    if not count:
+        return ""
+    return f"; in {count} of these {len(lost)} seeds it never does, which counts as all steps of a stage"
 
 
 def _measured(row: Row | None) -> list[tuple[Relearning, float]]:

@@ -211,7 +211,7 @@ def test_how_fast_lost_skills_come_back_is_told_with_their_names(
             )
             write_record(record, record_path(tmp_path / "records", "clbench/Even-v1", method, seed))
     text = page()
-    assert "plain fine-tuning loses a skill in 2 of 2 seeds (most lost: `skill_1` in 2)." in text
+    assert "plain fine-tuning loses a skill in 2 of 2 seeds (`skill_1` in 2)." in text
     assert "It meets the criterion again after 10 [" in text
     told = "A policy without pretraining, which has learned the targets, takes 20 (`skill_1` in 2)." in text
     assert told == (other == "skill_1"), "another skill says nothing of this one"
@@ -231,7 +231,7 @@ def test_a_skill_that_does_not_come_back_is_said_to_be_gone(
             relearning=Relearning("skill_1", 0, 20 if seed else 8, not seed),
         )
         write_record(record, record_path(tmp_path / "records", "clbench/Even-v1", "sft", seed))
-    assert "; 2 of the 3 never did, and count with all steps of a stage." in page()
+    assert "; in 2 of these 3 seeds it never does, which counts as all steps of a stage." in page()
 
 
 @pytest.mark.long
