@@ -60,10 +60,10 @@ def replay(subject: Subject, progress: ProgressCallback) -> list[Check]:
     # the shipped policy of seed 0 is the same on all processors, but training it further is not
     another_processor = any(one not in (None, here) for one, here in zip(theirs, ours, strict=True))
     if another_processor or not _same_pretraining(subject):
-        made, here = (" with ".join(one or "unknown" for one in both) for both in (theirs, ours))
+        there, here = (" with ".join(one or "unknown" for one in both) for both in (theirs, ours))
         result = (
             f"{'training' if another_processor else 'pretraining'} does not give the same policy here as on "
-            f"the machine of the record (its processor: {made}, here: {here}): repeat it on one like that"
+            f"the machine of the record (its processor: {there}, here: {here}): repeat it on one like that"
         )
         return [Check("policies", result, None)]
     kept = kept_stages(subject.resolved, subject.request.checkpoints)
