@@ -53,7 +53,7 @@ Rows = NDArray[np.float64]
 def make(task: Task) -> World:
     """Return the world of a task, or skip the test where a package that it needs is not installed."""
     try:
-        require_packages(task.packages, task.name)
+        require_packages(task.packages, f"the suite {task.suite}")
     except MissingPackageError as error:
         pytest.skip(str(error))
     world: World = resolve(task.world)()
