@@ -19,13 +19,13 @@ from torch import Tensor, nn
 
 from clbench.base.seeding import seeded
 from clbench.base.strict_json import StrictJSONError, check_json
-from clbench.base.text import did_you_mean
+from clbench.base.text import counted, did_you_mean
 from clbench.data.training_data import TrainingData
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.adaptation import Step
 from clbench.learning.hooks import HOOKS
 from clbench.learning.method import Method, Stage
-from clbench.learning.optimise import MethodError, deterministic
+from clbench.learning.optimise import MethodError, deterministic, steps_counted
 from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.prior import Prior, Source, UndeclaredAccessError
 from clbench.learning.trainer import Trainer
@@ -218,13 +218,16 @@ class ToyRun:
         self._hook, self._running = hook, True
         changes: list[str] = []
         try:
-            with watched(changes, generators=hook in UNSEEDED):
+            with watched(changes, generators=hook in UNSEEDED), steps_counted() as taken:
                 result = function(*map(self._watched_data, arguments), **named)
         except Exception as error:
             raise self._fault(hook, error) from error
         finally:
             self._running = False
             self.changes.update(dict.fromkeys((hook, change) for change in changes))
+        if hook == "start_task" and taken():  # runs refuse it where a criterion ends the stage
+            expected = "no optimiser steps: a target is learned in the steps that follow"
+            raise _unsound("start_task", expected, counted(taken(), "step"))
         if hook not in (*UNSEEDED, "load_state"):
             self.generators.setdefault(hook, read(GENERATORS))
         check = getattr(self, f"_checked_{hook}", None)

@@ -1,8 +1,8 @@
 """Runs whose stages end when the target is learned."""
 
 import importlib
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,13 +11,16 @@ import pytest
 import torch
 from eager import EAGER
 from helpers import stage_policies
+from torch import nn
 
 from clbench.base.cache import cache_folder
 from clbench.evaluation.checks import Checker
 from clbench.evaluation.examiner import Examiner
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.adaptation import Step
+from clbench.learning.method import Method, Stage
 from clbench.learning.trainer import Trainer
+from clbench.policy.policy import Policy
 from clbench.policy.transformer import TransformerPolicy
 from clbench.records.reader import read_record
 from clbench.records.record import Record
@@ -30,6 +33,7 @@ from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
 from clbench.spec.protocol import Point, check_steps
 from clbench.spec.registry import load_scenario
+from clbench.testing import ContractError, check_method
 
 verification = importlib.import_module("clbench.leaderboard.submission.verify")
 subject = importlib.import_module("clbench.leaderboard.submission.subject")
@@ -173,6 +177,29 @@ def test_a_stage_that_never_meets_the_criterion_takes_all_its_steps(tmp_path: Pa
     scores = Scores.from_record(record)
     assert measure("steps_to_criterion", scores) == 200
     assert scores.met.tolist() == [0]
+
+
+@dataclass
+class Hasty(Method):
+    """Learns the target before the first step that counts."""
+
+    def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
+        optimiser = torch.optim.SGD(policy.parameters(), 1e-3)
+        for _ in range(3):
+            optimiser.zero_grad()
+            policy.action_loss(stage.target.sample(8)).mean().backward()  # type: ignore[no-untyped-call]
+            optimiser.step()
+        return policy.parameters()
+
+
+def test_a_target_is_not_learned_before_the_steps_that_count(
+    tmp_path: Path, stranger: Callable[[type[Method]], str]
+) -> None:
+    record = execute(RunSpec(EAGER.id, stranger(Hasty), seed=0), tmp_path)
+    assert record.error is not None
+    assert "start_task() took 3 optimiser steps. A target is learned" in record.error["message"]
+    with pytest.raises(ContractError, match=r"no optimiser steps: a target is learned in the steps that"):
+        check_method(Hasty)
 
 
 def test_each_seed_learns_the_targets_in_its_own_order(tmp_path: Path) -> None:
