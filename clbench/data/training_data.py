@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from torch import Tensor
+
 from clbench.data.demonstrations import Demonstrations, load_demonstrations
-from clbench.data.questions import Questions, load_questions
+from clbench.data.questions import Questions, load_questions, scored_questions
+from clbench.policy.batch import QuestionBatch
 from clbench.policy.policy import PolicyConfig
+from clbench.spec.protocol import ScoredSplit
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 
@@ -35,6 +39,14 @@ class TrainingData:
         """
         questions, test_questions = load_questions(scenario)
         return cls(scenario, config, questions, test_questions)
+
+    def scored_questions(self, split: ScoredSplit) -> tuple[Tensor, QuestionBatch]:
+        """Return the kinds and the questions of a run that is scored on a split.
+
+        A tuning run, which is scored on validation episodes, must not see the test questions.
+        """
+        questions = self.questions if split == "validation" else self.test_questions
+        return scored_questions(questions, self.scenario.budget.test_questions)
 
     def demonstrations(self, task: Task) -> Demonstrations:
         """Return the demonstrations of a task, which are read on first use.

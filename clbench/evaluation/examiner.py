@@ -11,7 +11,6 @@ from torch import Tensor
 
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import torch_generator
-from clbench.data.questions import scored_questions
 from clbench.data.training_data import TrainingData
 from clbench.evaluation.answers import answer
 from clbench.evaluation.episodes import Episode, Trial
@@ -55,10 +54,8 @@ class Examiner:
 
     @cached_property
     def _asked(self) -> tuple[Tensor, QuestionBatch]:
-        """Kinds and questions to score: a tuning run must not see the test questions."""
-        tuning = self._protocol.split == "validation"
-        questions = self._data.questions if tuning else self._data.test_questions
-        return scored_questions(questions, self._scenario.budget.test_questions)
+        """Kinds and questions to score."""
+        return self._data.scored_questions(self._protocol.split)
 
     @cached_property
     def _anchor(self) -> Gaussian | None:

@@ -58,6 +58,11 @@ def _ids() -> dict[str, int]:
 
 
 @cache
+def _tokens() -> dict[int, str]:
+    return {number: token for token, number in _ids().items()}
+
+
+@cache
 def _tokenizer(length: int) -> Tokenizer:
     tokenizer = Tokenizer(models.WordPiece(_ids(), unk_token=PADDING))
     tokenizer.normalizer = normalizers.Sequence(
@@ -108,7 +113,7 @@ def decode(words: Tensor) -> list[str]:
 
     They are in lower case, and without accents and punctuation.
     """
-    tokens = {number: token for token, number in _ids().items()}
+    tokens = _tokens()
     return [" ".join(tokens[one] for one in row if one).replace(" ##", "") for row in words.tolist()]
 
 

@@ -13,7 +13,6 @@ from scipy.stats import hypergeom
 
 from clbench.base.errors import InputError
 from clbench.base.progress import ProgressCallback
-from clbench.data.questions import load_questions, scored_questions
 from clbench.data.training_data import TrainingData
 from clbench.evaluation.answers import answer
 from clbench.evaluation.checks import Checker
@@ -232,15 +231,13 @@ def _outcome(row: EpisodeRow) -> str:
 
 
 def _replay_answers(subject: Subject, policies: Sequence[Policy]) -> Check:
-    scenario = subject.scenario
     protocol = subject.protocol
-    training, test = load_questions(scenario)
-    questions = training if protocol.split == "validation" else test  # a tuning run sees no test question
-    kind, asked = scored_questions(questions, scenario.budget.test_questions)
+    data = TrainingData.open(subject.scenario, policies[0].config)
+    kind, asked = data.scored_questions(protocol.split)
     again = [
         (*protocol.end(stage), *counts)
         for stage, policy in enumerate(policies)
-        for counts in answer(policy, questions.kinds, kind, asked)
+        for counts in answer(policy, data.questions.kinds, kind, asked)
     ]
     rows = zip(*subject.run.record.answers.values(), strict=True)
     theirs = {row for row in rows if protocol.is_end(Point(*row[:2]))}
