@@ -222,6 +222,7 @@ def verify(
     scenario: ScenarioId | None = None,
     checkpoints: Path | None = None,
     pretrain: Annotated[bool, Parameter(negative="")] = False,
+    any_processor: Annotated[bool, Parameter(negative="")] = False,
     by: str | None = None,
     workers: Annotated[int | None, whole_number(1)] = None,
     records: Path = RECORDS,
@@ -244,6 +245,8 @@ def verify(
         scenario: module:id of the scenario, if clbench does not register it.
         checkpoints: Folder of policies from `clbench run --checkpoints` (default: train them again).
         pretrain: At the tier retrained, also repeat the pretraining (default: use the cached policy).
+        any_processor: Train again also on a processor that may compute otherwise than the record's. Equal
+            results prove the record; other results prove nothing.
         by: Your name, for the file (default: none).
         workers: Number of verifications at once, each a process with one thread (default: all cores; for
             records of cuda, all GPUs).
@@ -270,7 +273,9 @@ def verify(
             )
         found, records = _placed(_found(paths, records), records)
     seed = secrets.randbits(48) if seed is None else seed
-    request = Request(tier, episodes, seed, method, scenario, checkpoints, pretrain, by, policy)
+    request = Request(
+        tier, episodes, seed, method, scenario, checkpoints, pretrain, by, policy, any_processor=any_processor
+    )
     done = run_verifications(found, records, request, workers, Console(stderr=as_json))
     if as_json:
         print_json(

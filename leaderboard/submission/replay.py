@@ -55,45 +55,37 @@ def replay(subject: Subject, progress: ProgressCallback) -> list[Check]:
         check_device(spec.device)
     except InputError as error:  # the rest needs the device of the run
         return [Check("policies", str(error), None)]
-    theirs, ours = (_processor(made) for made in (run.record.fingerprint, subject.here))
-    # the shipped policy of seed 0 is the same on all processors, but training it further is not
-    another_processor = any(one not in (None, here) for one, here in zip(theirs, ours, strict=True))
-    if another_processor or not _same_pretraining(subject):
-        there, here = (" with ".join(one or "unknown" for one in both) for both in (theirs, ours))
+    processors = subject.other_processor
+    tried = processors is None or subject.request.any_processor
+    if not tried or not _same_pretraining(subject):
+        what = "pretraining" if tried else "training"
+        elsewhere = f" ({processors})" if processors else ""
+        anyway = "" if tried else ", or try it here with --any-processor"
         result = (
-            f"{'training' if another_processor else 'pretraining'} does not give the same policy here as on "
-            f"the machine of the record (its processor: {there}, here: {here}): repeat it on one like that"
+            f"{what} does not give the same policy here as on the machine of the record{elsewhere}: "
+            f"repeat it on one like that{anyway}"
         )
         return [Check("policies", result, None)]
+    where = f", played on another processor ({processors})" if processors else ""
     kept = kept_stages(subject.resolved, subject.request.checkpoints)
     with deterministic(spec.device):
         lengths = None
         if kept is None:
             made = make_stages(subject.resolved, progress)
             policies, lengths = load_stages(subject.resolved, made), lengths_of_stages(subject.resolved, made)
-            checks = [Check("policies", "trained again", True)]
+            checks = [Check("policies", f"trained again{where}", True)]
         else:
             policies = load_stages(subject.resolved, kept)
-            checks = [Check("policies", "kept by the run", True), _start(subject, policies[0], progress)]
+            checks = [
+                Check("policies", f"kept by the run{where}", True),
+                _start(subject, policies[0], progress),
+            ]
         checks += [_replay_episodes(subject, policies), _replay_answers(subject, policies)]
     if subject.scenario.budget.criterion:
         checks += _replay_ends(subject, policies, lengths)
     if kept is not None:
         checks.append(_go_on(subject, kept, policies))
     return checks
-
-
-def _processor(made: dict[str, Any]) -> tuple[str | None, str | None]:
-    """Return the maker and the instructions of the processor in a fingerprint, None where it lacks one.
-
-    The maker is the first word of the model. MKL has other code for Intel's processors than for others with
-    the same instructions.
-    """
-    hardware = made.get("hardware")
-    values = hardware if isinstance(hardware, dict) else {}
-    model, instructions = (values.get(name) for name in ("processor", "instructions"))
-    maker = model.split()[0] if isinstance(model, str) and model.strip() else None
-    return maker, instructions if isinstance(instructions, str) else None
 
 
 def _same_pretraining(subject: Subject) -> bool:

@@ -56,6 +56,8 @@ class Request:
     """Name of the verifier, if given."""
     policy: str | None = None
     """module:Class of a policy that is not built in; the name in a record alone is never imported."""
+    any_processor: bool = False
+    """Whether to repeat training also on a processor that may compute otherwise than the record's."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +121,31 @@ class Subject:
     def here(self) -> dict[str, Any]:
         """The fingerprint of this machine; it plays a rollout of every world."""
         return fingerprint(self.scenarios[1])
+
+    @property
+    def other_processor(self) -> str | None:
+        """The record's processor and this one, in words, if they may compute otherwise; else None.
+
+        Equal results still prove a record that was made on another processor; other results prove nothing.
+        """
+        theirs, ours = (_processor(made) for made in (self.run.record.fingerprint, self.here))
+        if all(one in (None, here) for one, here in zip(theirs, ours, strict=True)):
+            return None
+        there, here = (" with ".join(one or "unknown" for one in both) for both in (theirs, ours))
+        return f"its processor: {there}, here: {here}"
+
+
+def _processor(made: dict[str, Any]) -> tuple[str | None, str | None]:
+    """Return the maker and the instructions of the processor in a fingerprint, None where it lacks one.
+
+    The maker is the first word of the model. MKL has other code for Intel's processors than for others with
+    the same instructions.
+    """
+    hardware = made.get("hardware")
+    values = hardware if isinstance(hardware, dict) else {}
+    model, instructions = (values.get(name) for name in ("processor", "instructions"))
+    maker = model.split()[0] if isinstance(model, str) and model.strip() else None
+    return maker, instructions if isinstance(instructions, str) else None
 
 
 def some(wrong: Sequence[str]) -> str:

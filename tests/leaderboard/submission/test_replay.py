@@ -13,7 +13,7 @@ import pytest
 import torch
 from eager import EAGER
 from safetensors.torch import load_file, save_file
-from verification import TOY, edit, failures, verify
+from verification import TOY, edit, failures, flip, verify
 
 from clbench.base.cache import MANIFEST, cached
 from clbench.evaluation.rollouts import Evaluator
@@ -73,6 +73,30 @@ def test_the_record_of_a_machine_that_pretrains_otherwise_cannot_be_replayed_her
     )
     (check,) = (check for check in verify(mine, "replayed", honest) if check.passed is None)
     assert "(its processor: unknown with NEON, here: " in check.found
+    assert tiers.tier_of(mine) == "recomputed"
+
+
+def from_another_maker(values: dict[str, Any]) -> None:
+    values["fingerprint"]["hardware"]["processor"] = "Abacus 9000"
+
+
+@pytest.mark.long
+def test_equal_results_on_another_processor_prove_a_record_to_those_who_try(mine: Path, honest: Path) -> None:
+    edit(mine, from_another_maker)
+    checks = verify(mine, "replayed", honest, any_processor=True)
+    assert all(check.passed for check in checks)
+    (policies,) = (check for check in checks if check.name == "policies")
+    assert policies.found.startswith("kept by the run, played on another processor (its processor: Abacus")
+    assert tiers.tier_of(mine) == "replayed"
+
+
+@pytest.mark.long
+def test_other_results_on_another_processor_prove_nothing(mine: Path, honest: Path) -> None:
+    edit(mine, from_another_maker)
+    edit(mine, lambda values: flip(values, 0, 60))
+    (check,) = (one for one in verify(mine, "replayed", honest, any_processor=True) if not one.passed)
+    assert check.passed is None
+    assert "1 of " in check.found and "its processor: Abacus" in check.found
     assert tiers.tier_of(mine) == "recomputed"
 
 
