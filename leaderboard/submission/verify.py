@@ -121,7 +121,7 @@ def verify(
 
 
 def _in_doubt(subject: Subject, checks: list[Check]) -> list[Check]:
-    """Return the checks of a repetition: with other packages or another processor, a difference proves nothing."""
+    """Return the checks of a repetition: differences with other packages or processors prove nothing."""
     # a later clbench may score the same, as a later commit may
     packages = {name: version for name, version in subject.here["versions"].items() if name != "clbench"}
     other = _made_with(subject, packages)
