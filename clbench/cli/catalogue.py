@@ -282,6 +282,7 @@ def _machine() -> dict[str, str]:
 
     from clbench.base.cache import cache_folder
     from clbench.jobs.folders import minari_folder
+    from clbench.runs.fingerprint import arithmetic_hash
     from clbench.worlds.gl_backend import DEBIAN_PACKAGES, rendering_fault
     from clbench.worlds.threads import cores
 
@@ -295,6 +296,7 @@ def _machine() -> dict[str, str]:
         "python": sys.version.split()[0],
         "cores": f"{cores()} ({torch.get_num_threads()} threads in PyTorch; a run uses one)",
         "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else "none (and none is needed)",
+        "arithmetic": f"{arithmetic_hash()} (the same on machines that train to the same bits)",
         **rendering,
         "films": _films(faults),
         "cache": _folder(cache_folder(), "CLBENCH_CACHE"),

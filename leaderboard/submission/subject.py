@@ -129,23 +129,29 @@ class Subject:
         Equal results still prove a record that was made on another processor; other results prove nothing.
         """
         theirs, ours = (_processor(made) for made in (self.run.record.fingerprint, self.here))
-        if all(one in (None, here) for one, here in zip(theirs, ours, strict=True)):
+        if all(theirs[name] in (None, value) for name, value in ours.items()):
             return None
-        there, here = (" with ".join(one or "unknown" for one in both) for both in (theirs, ours))
-        return f"its processor: {there}, here: {here}"
+        there, here = (
+            f"{values['maker'] or 'unknown'} with {values['instructions'] or 'unknown'}"
+            for values in (theirs, ours)
+        )
+        if there == here:
+            there, here = (f"{there}, arithmetic {values['arithmetic']}" for values in (theirs, ours))
+        return f"its processor: {there}; here: {here}"
 
 
-def _processor(made: dict[str, Any]) -> tuple[str | None, str | None]:
-    """Return the maker and the instructions of the processor in a fingerprint, None where it lacks one.
+def _processor(made: dict[str, Any]) -> dict[str, str | None]:
+    """Return what decides the bits of training, of a fingerprint: None where it lacks a value.
 
-    The maker is the first word of the model. MKL has other code for Intel's processors than for others with
-    the same instructions.
+    The maker is the first word of the model. The oldest records do not have the instructions, and those
+    before `arithmetic_hash` not the arithmetic.
     """
     hardware = made.get("hardware")
     values = hardware if isinstance(hardware, dict) else {}
-    model, instructions = (values.get(name) for name in ("processor", "instructions"))
+    model, *others = (values.get(name) for name in ("processor", "instructions", "arithmetic"))
     maker = model.split()[0] if isinstance(model, str) and model.strip() else None
-    return maker, instructions if isinstance(instructions, str) else None
+    instructions, arithmetic = (value if isinstance(value, str) else None for value in others)
+    return {"maker": maker, "instructions": instructions, "arithmetic": arithmetic}
 
 
 def some(wrong: Sequence[str]) -> str:

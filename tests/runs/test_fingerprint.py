@@ -1,5 +1,7 @@
 """The fingerprint of a record: software, hardware, and the bits of the simulator."""
 
+import os
+import platform
 import shutil
 import subprocess
 import sys
@@ -106,10 +108,27 @@ def test_processors_of_two_makers_compute_otherwise_with_the_same_instructions(
     assert {**found[0], "maker": None} == {**found[1], "maker": None}
 
 
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="other processors lack this code")
+def test_the_arithmetic_is_measured_and_not_read_from_a_name() -> None:
+    code = "from clbench.runs.fingerprint import arithmetic_hash; print(arithmetic_hash())"
+    settings: tuple[dict[str, str], ...] = ({}, {"OMP_NUM_THREADS": "3"}, {"ATEN_CPU_CAPABILITY": "default"})
+    plain, threads, without_vectors = (
+        subprocess.run(
+            [sys.executable, "-c", code],
+            env={**os.environ, **setting},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for setting in settings
+    )
+    assert plain == threads != without_vectors
+
+
 def test_a_fingerprint_names_versions_hardware_and_every_world() -> None:
     found = fingerprint(TOY)
     assert found["versions"]["mujoco"] == version("mujoco")
-    assert set(found["hardware"]) == {"machine", "system", "processor", "instructions"}
+    assert set(found["hardware"]) == {"machine", "system", "processor", "instructions", "arithmetic"}
     assert all(found["hardware"].values())
     assert set(found["rollouts"]) == {"clbench.testing:ToyWorld"}
     assert found["commit"] is None or len(found["commit"]["id"]) == 40

@@ -179,13 +179,18 @@ FORGERIES = {
         "replayed", "pretraining does not give the same policy", set_in("fingerprint", pretrained="0" * 16)
     ),
     "other instructions of the processor": Forgery(
-        "replayed", " with NEON, here: ", set_in("fingerprint.hardware", instructions="NEON")
+        "replayed", " with NEON; here: ", set_in("fingerprint.hardware", instructions="NEON")
     ),
     "another maker of the processor": Forgery(
         "replayed",
         "policies: training does not give the same policy here as on the machine of the record (its "
         "processor: Abacus with ",
         set_in("fingerprint.hardware", processor="Abacus 9000"),
+    ),
+    "another arithmetic of the processor": Forgery(
+        "replayed",
+        ", arithmetic 0000000000000000; here: ",
+        set_in("fingerprint.hardware", arithmetic="0" * 16),
     ),
     # ---- what only the whole run says
     "a success on the way": Forgery(

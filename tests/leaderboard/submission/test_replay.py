@@ -72,7 +72,7 @@ def test_the_record_of_a_machine_that_pretrains_otherwise_cannot_be_replayed_her
         lambda values: values["fingerprint"].update(pretrained="0" * 16, hardware={"instructions": "NEON"}),
     )
     (check,) = (check for check in verify(mine, "replayed", honest) if check.passed is None)
-    assert "(its processor: unknown with NEON, here: " in check.found
+    assert "(its processor: unknown with NEON; here: " in check.found
     assert tiers.tier_of(mine) == "recomputed"
 
 
@@ -132,7 +132,7 @@ def test_the_replayed_episodes_are_drawn_at_random_from_the_ends_of_all_stages(
 @pytest.mark.parametrize(
     ("tier", "change", "message"),
     [
-        ("replayed", {"hardware": {"instructions": "NEON"}}, " with NEON, here: "),
+        ("replayed", {"hardware": {"instructions": "NEON"}}, " with NEON; here: "),
         ("retrained", {"versions": {"torch": "1.0"}}, "torch was 1.0 and is "),
         ("recomputed", {"versions": {"mujoco": "1.0"}, "rollouts": {}}, "mujoco was 1.0 and is "),
     ],
