@@ -150,9 +150,17 @@ class TiedGain:
         return self.gain.is_above(0)
 
 
-def is_certain_over(tied: Iterable[TiedGain]) -> bool:
-    """Return whether a gain is certain over every setting that tuning rated as highly as the chosen one."""
-    return all(one.is_certain for one in tied)
+def side_of_zero(gain: Estimate, tied: Iterable[TiedGain]) -> int:
+    """Return where the intervals of a gain lie: 1 above 0, -1 below it, 0 if one of them contains it.
+
+    Args:
+        gain: Gain over plain fine-tuning at the setting that tuning chose.
+        tied: The gains over the settings that tuning rated as highly.
+    """
+    gains = [gain, *(one.gain for one in tied)]
+    if all(one.is_above(0) for one in gains):
+        return 1
+    return -1 if all(one.is_below(0) for one in gains) else 0
 
 
 def tied_gains(

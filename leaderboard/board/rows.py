@@ -25,12 +25,13 @@ from clbench.spec.references import BASELINE
 
 from .agreement import Concordance, concordance
 from .costs import costs_of
-from .frontier import Curve, TiedGain, frontiers_of, ladder_of, read_ladder, tied_gains
+from .frontier import Curve, TiedGain, frontiers_of, ladder_of, read_ladder, side_of_zero, tied_gains
 from .orders import Orders, orders_of
 from .runs import ALIKE, Run, Sifted, mean_of, read_run, read_runs, sift_by
 from .summary import (
     DIVISIONS,
     ELSEWHERE,
+    GAIN,
     RANKED_BY,
     WITH_DEMONSTRATIONS,
     WITHOUT_DEMONSTRATIONS,
@@ -295,6 +296,32 @@ def apart_from_baseline(rows: Iterable[Row]) -> frozenset[str]:
             own = set(letters[BASELINE])
             apart |= {method for method, others in letters.items() if not own & set(others)}
     return frozenset(apart)
+
+
+def told_above(rows: Iterable[Row]) -> list[Row]:
+    """Return the rows that are told apart from plain fine-tuning at its chosen setting, and end above it."""
+    members = list(rows)
+    apart = apart_from_baseline(members)
+    return [row for row in members if row.method in apart and (row.estimates[GAIN].value or 0.0) > 0]
+
+
+def certain_sides(rows: Iterable[Row], tied: Mapping[str, Iterable[TiedGain]]) -> dict[str, int]:
+    """Return the methods that certainly end above plain fine-tuning, with 1, or below it, with -1.
+
+    They are told apart from it, and the intervals of all their gains lie on one side of 0.
+
+    Args:
+        rows: The rows of a scenario.
+        tied: Gains over settings of plain fine-tuning that tuning rated as highly, by method.
+    """
+    members = list(rows)
+    apart = apart_from_baseline(members)
+    sides = {
+        row.method: side_of_zero(row.estimates[GAIN], tied.get(row.method, ()))
+        for row in members
+        if row.method in apart
+    }
+    return {method: side for method, side in sides.items() if side}
 
 
 def agreement(rows: Iterable[Row]) -> Concordance | None:

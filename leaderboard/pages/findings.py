@@ -15,9 +15,8 @@ from clbench.scoring.intervals import Estimate
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.references import BASELINE, FROZEN
 
-from ..board.frontier import is_certain_over
 from ..board.predictors import predictions
-from ..board.rows import Board, Row, apart_from_baseline
+from ..board.rows import Board, Row, certain_sides
 from ..board.summary import WITHOUT_DEMONSTRATIONS, grouped, tables_of
 from ..claims.claim import KNOWLEDGE, PREDICATES, Claim, Verdict, tally
 from ..claims.evidence import Evidence
@@ -120,15 +119,14 @@ def _replay(boards: dict[str, list[Row]], tied: Tied) -> Section:
     for name, rows in boards.items():
         baseline = next((row for row in rows if row.method == BASELINE), None)
         usual = f"; plain fine-tuning takes {_steps(baseline)}{_missed(baseline)}" if baseline else ""
-        apart = apart_from_baseline(rows)
+        sides = certain_sides(rows, tied.get(name, {}))
         for row in by_gain(rows):
             kept = row.costs.get("bytes_kept")
             if row.division in WITHOUT_DEMONSTRATIONS or not kept:
                 continue
             gain = row.estimates["gain"]
-            certain = row.method in apart and is_certain_over(tied.get(name, {}).get(row.method, ()))
-            moves = "gains" if certain and (gain.value or 0) > 0 else "changes the final average by"
-            doubt = "" if certain else ", which is not certain"
+            moves = "gains" if sides.get(row.method) == 1 else "changes the final average by"
+            doubt = "" if row.method in sides else ", which is not certain"
             answers.append(
                 f"On {name}, `{row.method}` {moves} {format_interval(gain)}{doubt}, keeps "
                 f"{megabytes(int(kept))} between stages, and takes {_steps(row)} steps to learn a "

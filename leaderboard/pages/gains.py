@@ -10,8 +10,8 @@ from clbench.scoring.groups import differences_needed
 from clbench.scoring.intervals import Estimate
 from clbench.spec.references import BASELINE
 
-from ..board.frontier import TiedGain, is_certain_over
-from ..board.rows import Row, apart_from_baseline
+from ..board.frontier import TiedGain, side_of_zero
+from ..board.rows import Row, apart_from_baseline, certain_sides, told_above
 from ..board.summary import RANKED_BY, WITHOUT_DEMONSTRATIONS, competing
 from ..views.format import MISSING, format_interval, over_tied, rate_text
 
@@ -62,12 +62,9 @@ def gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[T
         return
     gains = {row.method: row.estimates["gain"] for row in others}
     apart = apart_from_baseline(rows)
-    better = {method: gains[method] for method in gains if method in apart and (gains[method].value or 0) > 0}
-    certain = {
-        method: gain
-        for method, gain in better.items()
-        if gain.is_above(0) and is_certain_over(tied.get(method, ()))
-    }
+    better = {row.method: row.estimates["gain"] for row in told_above(rows) if row.method in gains}
+    sides = certain_sides(rows, tied)
+    certain = {method: gain for method, gain in better.items() if sides.get(method) == 1}
     if certain:
         yield f"On {name}, yes: {_listed(certain)}."
     for method in better:
@@ -85,7 +82,9 @@ def gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[T
     if len(gains) > 1:
         alone += f", without correction for {len(gains)} comparisons"
     higher = {method: gain for method, gain in gains.items() if gain.is_above(0) and method not in better}
-    over_both = {method: gain for method, gain in higher.items() if is_certain_over(tied.get(method, ()))}
+    over_both = {
+        method: gain for method, gain in higher.items() if side_of_zero(gain, tied.get(method, ())) == 1
+    }
     if over_both:
         yield f"Higher {alone}: {_listed(over_both)}."
     if len(over_both) < len(higher):

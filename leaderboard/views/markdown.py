@@ -19,9 +19,9 @@ from clbench.records.paths import table_parts
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metric import Metric
 
-from ..board.frontier import TiedGain, is_certain_over
+from ..board.frontier import TiedGain
 from ..board.overall import overall
-from ..board.rows import Board, Row, apart_from_baseline
+from ..board.rows import Board, Row, certain_sides, told_above
 from ..board.summary import letters_of, tables_of
 from ..policies.compared import Comparisons
 from ..policies.decoders import read_decoding
@@ -81,12 +81,11 @@ def markdown(board: Board, comparisons: Comparisons) -> str:
 
 def _tied_text(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]]) -> str:
     """Return which rows are told apart above plain fine-tuning, but not from its settings rated as highly."""
-    apart = apart_from_baseline(rows)
-    unsure = [row for row in rows if row.method in apart and not is_certain_over(tied.get(row.method, ()))]
+    sides = certain_sides(rows, tied)
     found = [
         sentence
-        for row in unsure
-        if (row.estimates["gain"].value or 0.0) > 0
+        for row in told_above(rows)
+        if row.method not in sides
         for sentence in over_tied(name, row.method, row.estimates["gain"], tied[row.method])
     ]
     return " ".join(found)

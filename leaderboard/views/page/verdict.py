@@ -11,8 +11,8 @@ from clbench.scoring.intervals import Estimate
 from clbench.spec.references import BASELINE
 
 from ...board.costs import mean_step_ratio
-from ...board.frontier import TiedGain, is_certain_over
-from ...board.rows import Row, apart_from_baseline, mean_difference, standing_of
+from ...board.frontier import TiedGain
+from ...board.rows import Row, apart_from_baseline, certain_sides, mean_difference, standing_of
 from ...board.summary import (
     DIVISIONS,
     METHODS,
@@ -79,11 +79,8 @@ def headline(rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]] | None 
         for row in others
         if row.method in apart
     }
-    ahead = [
-        row
-        for row in others
-        if gains.get(row.method, 0.0) > 0 and is_certain_over((tied or {}).get(row.method, ()))
-    ]
+    sides = certain_sides(rows, tied or {})
+    ahead = [row for row in others if sides.get(row.method) == 1]
     if not apart and all(len(row.seeds) == 1 for row in members):
         methods = "the one other method cannot" if len(others) == 1 else "no method can"
         return (

@@ -15,7 +15,7 @@ from clbench.scoring.intervals import Estimate
 SCENARIO = "clbench/Even-v1"
 MODULE = "clbench.leaderboard.board.frontier"
 TiedGain = resolve(f"{MODULE}:TiedGain")
-is_certain_over = resolve(f"{MODULE}:is_certain_over")
+side_of_zero = resolve(f"{MODULE}:side_of_zero")
 frontiers_of, ladder_of, read_ladder, tied_gains = (
     resolve(f"{MODULE}:{name}") for name in ("frontiers_of", "ladder_of", "read_ladder", "tied_gains")
 )
@@ -77,12 +77,14 @@ def test_a_tied_setting_without_runs_shows_no_gain_that_would_be_certain(
     assert (one.factor, one.seeds, one.gain.value, one.is_certain) == (0.3, 0, None, False)
 
 
-def test_a_gain_is_certain_over_all_tied_settings_or_over_none() -> None:
-    sure, unsure = (TiedGain(0.3, Estimate(0.02, low, 0.03), 4) for low in (0.01, -0.01))
-    assert is_certain_over([])
-    assert is_certain_over([sure, sure])
-    assert not is_certain_over([sure, unsure])
-    assert not is_certain_over([unsure, sure])
+def test_a_gain_or_a_loss_is_certain_over_all_tied_settings_or_over_none() -> None:
+    gain, loss, neither = (Estimate(middle, middle - 0.01, middle + 0.01) for middle in (0.02, -0.02, 0.005))
+    up, down, unsure = (TiedGain(0.3, one, 4) for one in (gain, loss, neither))
+    assert [side_of_zero(one, []) for one in (gain, loss, neither)] == [1, -1, 0]
+    assert side_of_zero(gain, [up, up]) == 1
+    assert side_of_zero(loss, [down]) == -1
+    assert [side_of_zero(gain, tied) for tied in ([up, unsure], [unsure, up], [down])] == [0, 0, 0]
+    assert [side_of_zero(loss, tied) for tied in ([unsure], [up])] == [0, 0]
 
 
 def test_curves_of_a_method_with_other_settings_are_named_by_these(even_board: Callable[..., Path]) -> None:
