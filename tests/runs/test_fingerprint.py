@@ -1,7 +1,6 @@
 """The fingerprint of a record: software, hardware, and the bits of the simulator."""
 
 import os
-import platform
 import shutil
 import subprocess
 import sys
@@ -10,8 +9,9 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+import torch
 
-from clbench.runs.fingerprint import arithmetic, fingerprint, rollout_hash
+from clbench.runs.fingerprint import arithmetic, arithmetic_hash, fingerprint, rollout_hash
 from clbench.spec.registry import load_scenario
 
 TOY = load_scenario("clbench.testing:clbench/Toy-v0")
@@ -108,21 +108,27 @@ def test_processors_of_two_makers_compute_otherwise_with_the_same_instructions(
     assert {**found[0], "maker": None} == {**found[1], "maker": None}
 
 
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="other processors lack this code")
+def test_the_arithmetic_is_the_same_with_any_number_of_threads() -> None:
+    one, threads = arithmetic_hash(), torch.get_num_threads()
+    arithmetic_hash.cache_clear()
+    torch.set_num_threads(3)
+    try:
+        assert arithmetic_hash() == one
+    finally:
+        torch.set_num_threads(threads)
+
+
+@pytest.mark.skipif(
+    torch.backends.cpu.get_cpu_capability() == "DEFAULT",
+    reason="PyTorch has no other code for this processor",
+)
 def test_the_arithmetic_is_measured_and_not_read_from_a_name() -> None:
     code = "from clbench.runs.fingerprint import arithmetic_hash; print(arithmetic_hash())"
-    settings: tuple[dict[str, str], ...] = ({}, {"OMP_NUM_THREADS": "3"}, {"ATEN_CPU_CAPABILITY": "default"})
-    plain, threads, without_vectors = (
-        subprocess.run(
-            [sys.executable, "-c", code],
-            env={**os.environ, **setting},
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
-        for setting in settings
+    without_vectors = {**os.environ, "ATEN_CPU_CAPABILITY": "default"}
+    result = subprocess.run(
+        [sys.executable, "-c", code], env=without_vectors, capture_output=True, text=True, check=True
     )
-    assert plain == threads != without_vectors
+    assert result.stdout.strip() != arithmetic_hash()
 
 
 def test_a_fingerprint_names_versions_hardware_and_every_world() -> None:
