@@ -120,7 +120,7 @@ def test_the_arithmetic_is_the_same_with_any_number_of_threads() -> None:
 
 @pytest.mark.skipif(
     torch.backends.cpu.get_cpu_capability() == "DEFAULT",
-    reason="PyTorch has no other code for this processor",
+    reason="PyTorch has no other code here",
 )
 def test_the_arithmetic_is_measured_and_not_read_from_a_name() -> None:
     code = "from clbench.runs.fingerprint import arithmetic_hash; print(arithmetic_hash())"
