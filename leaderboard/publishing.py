@@ -53,16 +53,21 @@ def site_of(records: Path) -> Path:
 def add_published(records: Path) -> int:
     """Copy the published records, with their verifications, to a folder of records; what is there stays.
 
+    The ladder goes beside it: without plain fine-tuning at the settings that tied in tuning, no gain over it
+    is certain.
+
     Returns:
-        The number of records that were missing.
+        The number of records that were missing in the folder itself.
     """
+    places = {PUBLISHED: records, ladder_of(PUBLISHED): ladder_of(records)}
     texts = {
         path: source.read_text(encoding="utf-8")
-        for source in sorted(PUBLISHED.rglob("seed-*"))
+        for folder, place in places.items()
+        for source in sorted(folder.rglob("seed-*"))
         if source.suffix in (".json", ".verified")
-        and not (path := records / source.relative_to(PUBLISHED)).exists()
+        and not (path := place / source.relative_to(folder)).exists()
     }
-    return sum(path.suffix == ".json" for path in write_all(texts))
+    return sum(path.suffix == ".json" and path.is_relative_to(records) for path in write_all(texts))
 
 
 def inputs_of(records: Path) -> dict[str, str]:

@@ -58,3 +58,5 @@ def test_nothing_leaks_to_the_top_level() -> None:
 def test_the_records_of_the_board_come_with_clbench() -> None:
     published = resolve("clbench.leaderboard.publishing:PUBLISHED")
     assert len(list((published / "Fetch-v1").rglob("seed-*.json"))) >= 88
+    tied = published.parent / "ladder" / "Fetch-v1" / "sft+step_factor=0.1"
+    assert len(list(tied.glob("seed-*.json"))) == 12  # without them, no gain over sft is certain

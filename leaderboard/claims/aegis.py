@@ -210,7 +210,7 @@ def keeps_answers(evidence: Evidence) -> Finding:
             "Length and learning rate of this scenario were chosen so that sft loses answers (A1), and aegis "
             "was not tuned here: it may keep answers at smaller rates.",
             *_when_lost(evidence, "aegis"),
-            *_near_the_anchor(anchor_ratio(evidence), "batches near the anchor need not keep the answers"),
+            *_near_the_anchor(anchor_ratio(evidence)),
             not_told_apart(
                 gains[0],
                 explains="the projection need not keep any answer",
@@ -218,7 +218,7 @@ def keeps_answers(evidence: Evidence) -> Finding:
             ),
             not_told_apart(
                 gains[1],
-                explains="the anchor's direction need not matter",
+                explains="aegis need not keep more than a random direction, which removes nearly no energy",
                 does_not="the anchor's direction matters",
             ),
         ),
@@ -275,33 +275,47 @@ def _of_stages(evidence: Evidence, name: str, what: str, stage: int | None = Non
     "A6",
     AEGIS,
     reported="stated about the projection; no number was found",
-    rule="Activation drift divided by sft's with the same seed: holds if the upper end is below 0.5; does "
-    "not hold if the lower end is above 0.5.",
-    settled="2026-11-23T07:13Z",
+    rule="Distance of the robot's batch to the anchor at the end of the first stage, which AEGIS defines as "
+    "the drift, divided by that with a random direction, which removes nearly no energy: holds if the upper "
+    "end is below 0.5; does not hold if the lower end is above 0.5.",
+    settled="2026-11-28T17:16Z",
     margin="half of the drift",
     scenarios=KNOWLEDGE,
 )
 def removes_drift(evidence: Evidence) -> Finding:
     """Removes the cumulative drift of activations."""
-    aegis, at_random = (drift_ratio(evidence, method) for method in ("aegis", "aegis+direction=random"))
     near = anchor_ratio(evidence)
+    on_questions, at_random = (
+        drift_ratio(evidence, method) for method in ("aegis", "aegis+direction=random")
+    )
     return Finding(
-        decided(holds=aegis.high < 0.5, fails=aegis.low > 0.5),
-        (aegis,),
-        (at_random, near),
-        _near_the_anchor(near, "the drift on questions, which the rule judges, is another quantity"),
-        what_would_change(aegis, 0.5),
+        decided(holds=near.high < 0.5, fails=near.low > 0.5),
+        (near,),
+        (on_questions, at_random),
+        _on_questions(on_questions),
+        what_would_change(near, 0.5),
     )
 
 
-def _near_the_anchor(near: Figure, but: str) -> tuple[str, ...]:
+def _on_questions(drift: Figure) -> tuple[str, ...]:
+    """Return a sentence if the hidden states of questions do not certainly drift less, too."""
+    if drift.value is None or drift.high < 0.5:
+        return ()
+    return (
+        "The anchor is one of the robot's batches. The hidden states of questions, whose answers can be lost "
+        f"nevertheless (A4), drift {drift.value:.2f} [{drift.low:.2f}, {drift.high:.2f}] times as far as "
+        "those of sft.",
+    )
+
+
+def _near_the_anchor(near: Figure) -> tuple[str, ...]:
     """Return a sentence if the projection certainly keeps the robot's batches nearer to the anchor."""
     if not near.high < 0.5:
         return ()
     figure = f"{near.value:.3f} [{near.low:.3f}, {near.high:.3f}]"
     return (
         "The projection acts: at the end of the first stage, the distance of the robot's batch to the anchor "
-        f"is {figure} of that with a random direction; {but}.",
+        f"is {figure} of that with a random direction; batches near the anchor need not keep the answers.",
     )
 
 

@@ -172,7 +172,8 @@ def _claims(judged: Sequence[Judged]) -> Section:
     answers = []
     for paper, every in grouped((one.claim.paper.name, one) for one in judged).items():
         answers.append(
-            f"{paper}: {tally(one.finding.verdict for one in every)}.{_those_that_hold(every)}{_ours(every)}"
+            f"{paper}: {tally(one.finding.verdict for one in every if not one.claim.ours)}."
+            f"{_those_that_hold(every)}{_ours(every)}"
         )
     boards = tuple(dict.fromkeys(one.evidence.scenario for one in judged))
     found = grouped((one.claim, one) for one in judged)
@@ -204,14 +205,22 @@ def _verdict_cell(one: Judged, what: str) -> str:
 
 
 def _explanations(judged: Sequence[Judged]) -> list[str]:
-    """Return the last conclusion from the figures and controls of each verdict that is a yes or a no."""
+    """Return the last conclusion from the figures and controls of each verdict that is a yes or a no.
+
+    A claim that fails where it was made to hold has the conditions beside it, as one that holds has.
+    """
     told = grouped(
-        ((one.claim.id, sentence), one.evidence.scenario)
+        ((one.claim, sentence), one.evidence.scenario)
         for one in judged
         if one.finding.verdict in ("holds", "holds in part", "does not hold")
         for sentence in one.finding.sentences[-1:]
     )
-    return [f"{claim} on {listed(boards)}: {sentence}" for (claim, sentence), boards in told.items()]
+    return [
+        f"{claim.id} on {listed(boards)}"
+        + (f", {MADE_FOR_IT}" if claim.scenarios == KNOWLEDGE else "")
+        + f": {sentence}"
+        for (claim, sentence), boards in told.items()
+    ]
 
 
 def _what_would_show_it(judged: Sequence[Judged]) -> list[str]:
@@ -246,9 +255,12 @@ def _those_that_hold(judged: Sequence[Judged]) -> str:
 
 
 def _ours(judged: Sequence[Judged]) -> str:
-    """Return in a sentence which claims are our reading of a paper; empty without one."""
-    ours = dict.fromkeys(one.claim.id for one in judged if one.claim.ours)
-    return f" {listed(ours)} {'is' if len(ours) == 1 else 'are'} our reading of the paper." if ours else ""
+    """Return in a sentence which claims are our reading of a paper; they are not counted."""
+    found = grouped((one.claim.id, one.finding.verdict) for one in judged if one.claim.ours)
+    return "".join(
+        f" {claim} is our reading of the paper and is not counted: {tally(verdicts)}."
+        for claim, verdicts in found.items()
+    )
 
 
 def _predictors(boards: dict[str, list[Row]]) -> Section:

@@ -289,14 +289,27 @@ def over_tied(name: str, words: str, gain: Estimate, tied: Sequence[TiedGain]) -
 
     `words` name the method, with the markup of the page.
     """
+    chosen = format_interval(gain, ".3f")
     for one in tied:
-        sure = one.is_certain
-        chosen, other = format_interval(gain, ".3f"), format_interval(one.gain, ".3f")
+        sure, other = one.is_certain, format_interval(one.gain, ".3f")
+        over = (
+            f"{'and' if sure else 'but'} {other} at {rate_text(one.factor)}, which scored the same in tuning"
+        )
+        if not one.seeds:
+            over = f"but {no_tied_runs(one)}"
+        seeds = f" ({counted(one.seeds, 'seed')})" if one.seeds else ""
         yield (
             f"On {name}, {'for' if sure else 'not for'} certain: {words} gains {chosen} over plain "
-            f"fine-tuning at the setting that tuning chose, {'and' if sure else 'but'} {other} at "
-            f"{rate_text(one.factor)}, which scored the same in tuning ({counted(one.seeds, 'seed')})."
+            f"fine-tuning at the setting that tuning chose, {over}{seeds}."
         )
+
+
+def no_tied_runs(tied: TiedGain) -> str:
+    """Return in words that a setting of plain fine-tuning tied in tuning, and has no runs to compare with."""
+    return (
+        f"{rate_text(tied.factor)} scored the same in tuning, and the ladder beside these records has no "
+        "runs of it (`clbench leaderboard --published` copies ours)"
+    )
 
 
 def rate_text(factor: float) -> str:

@@ -23,7 +23,7 @@ from ...board.summary import (
     divisions_of,
 )
 from ..descriptions import RULES
-from ..format import NAMED, format_interval, number_text, rate_text
+from ..format import NAMED, format_interval, no_tied_runs, number_text, rate_text
 from .numbers import MISSING, cost, size
 
 
@@ -181,6 +181,8 @@ def _doubt(leader: Row, rows: Sequence[Row], apart: Container[str], tied: Sequen
     unsure = [one for one in tied if not one.is_certain]
     if not unsure:
         return ""
+    if not unsure[0].seeds:
+        return f"Its gain is not certain: for plain fine-tuning, {no_tied_runs(unsure[0])}."
     return (
         f"Tuning rated sft as highly at {rate_text(unsure[0].factor)}; over that setting, the gain is "
         f"{format_interval(unsure[0].gain, '+.2f')} and not certain."

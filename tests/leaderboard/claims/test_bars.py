@@ -188,7 +188,7 @@ CASES: list[tuple[str, str, Given]] = [
     ("F4", "undecided", {"time of fast_dvla": (1.0, 1.051)}),
     ("F4", "does not hold", {"time of fast_dvla": (1.051, 1.1)}),
     *[
-        ("A6", verdict, {"activation drift, aegis / sft": ratio})
+        ("A6", verdict, {"distance of a batch to the anchor, aegis / aegis+direction=random": ratio})
         for ratio, verdict in (
             ((0.1, 0.499), "holds"),
             ((0.1, 0.501), "undecided"),

@@ -46,6 +46,17 @@ def _shed(first: float, later: float) -> Callable[[Record], None]:
     return edit
 
 
+def _distances(*ends: Any) -> Callable[[Record], None]:
+    """Return an edit of records: the distance of the batch to the anchor at the end, by seed."""
+
+    def edit(record: Record) -> None:
+        record.diagnostics = {"1": {"anchor_distance": [90.0, ends[record.run.seed]]}}
+
+    return edit
+
+
+AWAY = "aegis+direction=random"
+
 CASES: list[tuple[str, str, Given]] = [
     ("C1", "holds", {"sft": {"kept": 0.2}}),
     ("C1", "does not hold", {"sft": {"kept": 1.0}}),
@@ -190,9 +201,17 @@ CASES: list[tuple[str, str, Given]] = [
     ("A5", "does not hold", {"aegis": {"edit": _shed(0.06, 0.002)}}),
     ("A5", "undecided", {"aegis": {"edit": _shed(0.009, 0.002)}}),
     ("A5", "undecided", {"aegis": {"diagnostics": {"1": {"energy_shed_mean": "little"}}}}),
-    ("A6", "holds", {"sft": {"drift": (8, 9, 10)}, "aegis": {"drift": 1.0}}),
-    ("A6", "does not hold", {"sft": {"drift": (8, 9, 10)}, "aegis": {"drift": 7.0}}),
-    ("A6", "undecided", {"sft": {"drift": 0.0}, "aegis": {"drift": 1.0}}),
+    ("A6", "holds", {"aegis": {"edit": _distances(2, 3, 4)}, AWAY: {"edit": _distances(200, 290, 400)}}),
+    (
+        "A6",
+        "does not hold",
+        {"aegis": {"edit": _distances(190, 300, 390)}, AWAY: {"edit": _distances(200, 290, 400)}},
+    ),
+    (
+        "A6",
+        "undecided",
+        {"aegis": {"edit": _distances(2, 290, 4)}, AWAY: {"edit": _distances(200, 290, 400)}},
+    ),
     ("F1", "holds in part", STEADY),
     ("F1", "undecided", {"sft@1": {"took": (77, 77)}}),
     ("F2", "holds", {**STEADY, VECTOR: {"took": (39, 39)}, AT_RANDOM: {"took": (77, 77)}}),
@@ -279,34 +298,32 @@ def test_what_would_change_a_rapid_loss_is_the_point_that_shows_it(bench: Bench)
     assert "sft after 50 steps of the first target" in finding.change
 
 
-def _distances(*ends: Any) -> Callable[[Record], None]:
-    """Return an edit of records: the distance of the batch to the anchor at the end, by seed."""
-
-    def edit(record: Record) -> None:
-        record.diagnostics = {"1": {"anchor_distance": [90.0, ends[record.run.seed]]}}
-
-    return edit
-
-
 def test_the_distance_to_the_anchor_is_that_of_the_same_seed_with_a_random_direction(bench: Bench) -> None:
-    bench.add("sft", drift=1.0)
+    bench.add("sft", drift=(1.0, 1.1, 1.2), right=(500, 400))
     bench.add("aegis", drift=0.9, edit=_distances(2.0, 1.1, 7.2))
-    bench.add("aegis+direction=random", edit=_distances(200.0, 100.0, 800.0))
+    bench.add(AWAY, edit=_distances(200.0, 100.0, 800.0))
     finding = bench.judge("A6")
-    (near,) = (one for one in finding.controls if one.what.startswith("distance of a batch"))
+    (near,) = finding.figures
     assert near.value == pytest.approx(0.01)
-    assert finding.sentences[0].startswith("The projection acts: at the end of the first stage")
-    assert f"is 0.010 [{near.low:.3f}, {near.high:.3f}] of that with" in finding.sentences[0]
+    (on_questions,) = finding.sentences
+    assert "drift 0.82 [0." in on_questions
+    bench.add("frozen")
+    (acts,) = (
+        one for one in bench.judge("A4").sentences if one.startswith("The projection acts: at the end")
+    )
+    assert f"is 0.010 [{near.low:.3f}, {near.high:.3f}] of that with" in acts
 
 
 @pytest.mark.parametrize("ends", [(250.0, 110.0, 700.0), (0.0, 1.0, 8.0), ("2", 1.0, 8.0)])
 def test_a_distance_that_is_not_certainly_smaller_or_no_number_says_nothing(
     bench: Bench, ends: tuple[Any, ...]
 ) -> None:
-    bench.add("sft")
+    bench.add("sft", right=(500, 400))
+    bench.add("frozen")
     bench.add("aegis", edit=_distances(*ends))
-    bench.add("aegis+direction=random", edit=_distances(200.0, 100.0, 800.0))
-    assert bench.judge("A6").sentences == ()
+    bench.add(AWAY, edit=_distances(200.0, 100.0, 800.0))
+    assert bench.judge("A6").verdict != "holds"
+    assert not any("projection acts" in one for one in bench.judge("A4").sentences)
 
 
 def test_the_seeds_in_which_aegis_sheds_little_are_counted(bench: Bench) -> None:

@@ -164,7 +164,7 @@ def test_claims_that_hold_are_named_since_some_are_about_plain_fine_tuning(
 def test_a_claim_is_a_line_with_a_verdict_for_each_board_what_explains_it_and_what_is_missing(
     even_board: Callable[..., Path], page: Callable[[], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first, second = map(resolve("clbench.leaderboard.claims.judges:CLAIMS").get, ("C2", "C7"))
+    first, second, made = map(resolve("clbench.leaderboard.claims.judges:CLAIMS").get, ("C2", "C7", "A4"))
     finding = resolve("clbench.leaderboard.claims.claim:Finding")
     figure = resolve("clbench.leaderboard.claims.evidence:Figure")
 
@@ -179,6 +179,7 @@ def test_a_claim_is_a_line_with_a_verdict_for_each_board_what_explains_it_and_wh
         judged(first, "c", "cannot be shown here", "kept", "It has no arm."),
         judged(second, "b", "undecided", "lost", "Nothing explains it."),
         judged(second, "c", "cannot be shown here", "lost in c"),
+        judged(made, "d", "does not hold", "answers", "It keeps none."),
     )
     monkeypatch.setattr("clbench.leaderboard.claims.judges.judge_all", lambda *_: every)
     fill(even_board, sft=0.4)
@@ -187,11 +188,15 @@ def test_a_claim_is_a_line_with_a_verdict_for_each_board_what_explains_it_and_wh
     assert "Half are 0" not in section
     assert "Nothing explains it" not in section
     assert "- What would show C2 and C7 on c: longer stages.\n" in section
-    assert "| id | claim | first figure | a | b | c |\n" in section
+    conditions = "the one scenario that was made to show it, by training far past learning and in large steps"
+    assert f"- A4 on d, {conditions}: It keeps none.\n" in section
+    assert "- ConSFT: of 3 verdicts, 2 do not hold and 1 cannot be shown here. C7 is our reading" in section
+    assert "is our reading of the paper and is not counted: of 2 verdicts, 1 is undecided" in section
+    assert "| id | claim | first figure | a | b | c | d |\n" in section
     value, none = "0.25 [0.12, 0.50]", "cannot be shown here"
-    cells = f"kept | does not hold: {value} | does not hold: {value} | {none}: {value} |"
+    cells = f"kept | does not hold: {value} | does not hold: {value} | {none}: {value} |  |"
     assert f"| C2 | {first.words} | {cells}\n" in section
-    assert f"| C7 | {second.words} | lost |  | undecided: {value} | {none} |\n" in section
+    assert f"| C7 | {second.words} | lost |  | undecided: {value} | {none} |  |\n" in section
 
 
 @pytest.mark.parametrize("other", ["skill_0", "skill_1"])

@@ -145,3 +145,8 @@ def test_a_gain_that_another_setting_of_plain_fine_tuning_takes_back_is_told_bel
         "but 0.007 [-0.016, 0.030] at 0.1 times the scenario's learning rate, which scored the same in "
         "tuning (4 seeds)."
     ) in markdown(dataclasses.replace(board, tied={"clbench/Even-v1": tied}), {}).replace("\\", "")
+    tied = {"lora": (TiedGain(0.1, Estimate(None, None, None), 0),)}
+    assert (
+        "but 0.1 times the scenario's learning rate scored the same in tuning, and the ladder beside these "
+        "records has no runs of it"
+    ) in markdown(dataclasses.replace(board, tied={"clbench/Even-v1": tied}), {}).replace("\\", "")

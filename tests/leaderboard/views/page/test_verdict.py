@@ -251,6 +251,12 @@ def test_a_card_says_why_the_gain_of_its_leader_is_not_certain(board: Callable[.
         "Tuning rated sft as highly at 0.1 times the scenario's learning rate; over that setting, the gain "
         "is +0.01 [-0.01, +0.03] and not certain."
     )
+    tied = {"lora": (TiedGain(0.1, Estimate(None, None, None), 0),)}
+    assert verdicts(rows, tied)[0].doubt == (
+        "Its gain is not certain: for plain fine-tuning, 0.1 times the scenario's learning rate scored the "
+        "same in tuning, and the ladder beside these records has no runs of it (`clbench leaderboard "
+        "--published` copies ours)."
+    )
     alike = board(sft=matrix(0.2), lora=matrix(0.25), finch=matrix(0.2))
     leader = alike[0]
     estimates = {**leader.estimates, "gain": Estimate(0.03, 0.01, 0.05)}
