@@ -65,7 +65,9 @@ def _text(name: str) -> str:
 def test_the_citation_has_the_version_and_the_licence_of_the_package() -> None:
     project = tomllib.loads(_text("pyproject.toml"))["project"]
     citation = dict(re.findall(r"^(version|license): (.+)$", _text("CITATION.cff"), flags=re.MULTILINE))
-    assert citation == {"version": project["version"], "license": project["license"]}
+    released = re.findall(r"^## (\d\S*) \(", _text("CHANGELOG.md"), flags=re.MULTILINE)
+    version = released[0] if released and ".dev" in project["version"] else project["version"]
+    assert citation == {"version": version, "license": project["license"]}
 
 
 def test_the_pre_commit_hooks_use_the_same_ruff_as_the_tests() -> None:
