@@ -34,12 +34,16 @@ from .figures import (
     learning_curve,
     loses_no_answers,
     question_drop,
+    share_of_steps,
 )
 
 AEGIS = Paper("AEGIS", ("2604.16067",))
 
 SHARES = ("energy_shed_mean", "energy_shed_highest", "layers_projected_mean")
 """Diagnostics of AEGIS that are shares."""
+
+WITH_A_LADDER = BOARDS[:2]
+"""The boards on whose ladders every method has run at every learning rate."""
 
 NOTHING_TO_KEEP = "sft does not certainly lose 0.01 of the answers: there is nothing to keep."
 LOSES_ANSWERS = "A longer or narrower fine-tuning, after which sft has certainly lost answers."
@@ -104,18 +108,20 @@ def _when_lost(evidence: Evidence, method: str) -> list[str]:
     rule="Supervision is lost if the upper end of the difference to sft in early success is below -0.05. "
     "Holds if stop_gradient's drop in question accuracy has an upper end below 0.01 and supervision is "
     "lost; does not hold if the lower end of the drop is above 0.01, or if the lower end of the difference "
-    "in early success is above -0.05. Cannot be shown here if sft does not certainly lose 0.01 of the "
-    "answers.",
-    settled="2026-11-23T07:13Z",
-    margin="0.01 of the answers, 0.05 of the success",
-    scenarios=KNOWLEDGE,
+    "in early success is above -0.05. Where sft does not certainly lose 0.01 of the answers, supervision "
+    "alone is judged, by the steps to the criterion at the scenario's learning rate, divided by sft's: "
+    "holds in part if the lower end is above 1.05; does not hold if the upper end is below it; else cannot "
+    "be shown here.",
+    settled="2026-11-28T17:29Z",
+    margin="0.01 of the answers, 0.05 of the success, 0.05 of the steps",
+    scenarios=(*WITH_A_LADDER, *KNOWLEDGE),
 )
 def stop_gradient_keeps_and_wastes(evidence: Evidence) -> Finding:
     """Stopping the gradient keeps knowledge but throws away supervision."""
     answers, early = question_drop(evidence, "stop_gradient"), early_success(evidence, "stop_gradient", "sft")
     of_sft = question_drop(evidence, "sft")
     if loses_no_answers(of_sft):
-        return Finding("cannot be shown here", (early, answers), (of_sft,), (NOTHING_TO_KEEP,), LOSES_ANSWERS)
+        return _by_steps(share_of_steps(evidence, "stop_gradient@1", "sft@1"), (early, answers, of_sft))
     by_answers = answers.low > 0.01 or early.high < -0.05
     return Finding(
         decided(
@@ -126,6 +132,22 @@ def stop_gradient_keeps_and_wastes(evidence: Evidence) -> Finding:
         (of_sft,),
         (),
         what_would_change(*((answers, 0.01) if by_answers else (early, -0.05))),
+    )
+
+
+def _by_steps(steps: Figure, others: tuple[Figure, ...]) -> Finding:
+    """Judge whether supervision is lost, where there is no knowledge to keep."""
+    if steps.low > 1.05 or steps.high < 1.05:
+        half = "Only the half on supervision was judged: sft does not certainly lose answers here."
+        return Finding(
+            decided(holds=False, in_part=steps.low > 1.05, fails=steps.high < 1.05),
+            (steps,),
+            others,
+            (half,),
+            what_would_change(steps, 1.05),
+        )
+    return Finding(
+        "cannot be shown here", (steps, *others[:2]), others[2:], (NOTHING_TO_KEEP,), LOSES_ANSWERS
     )
 
 

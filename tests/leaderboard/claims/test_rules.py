@@ -28,6 +28,8 @@ NO_REGULARISER = "fast_dvla+orthogonal=0.0+step_factor=1.0"
 LOSES: Given = {"sft": {"right": (500, 400)}, "frozen": {"right": (500, 500)}}
 """Plain fine-tuning forgets a fifth of the answers."""
 KEEPS: Given = {"sft": {"right": (500, 500)}, "frozen": {"right": (500, 500)}}
+IN_TIME: Given = {"sft": {"right": (500, 500), "took": (77, 77)}}
+"""Its stages end at the criterion, before it forgets an answer."""
 
 
 def _early_loss(record: Record) -> None:
@@ -180,6 +182,13 @@ CASES: list[tuple[str, str, Given]] = [
     ("A2", "does not hold", {**LOSES, "stop_gradient": {"right": (490, 300), "curve": 0.1}}),
     ("A2", "cannot be shown here", {**KEEPS, "stop_gradient": {"right": (500, 500), "curve": 0.1}}),
     ("A2", "undecided", {"stop_gradient": {"right": (500, 500), "curve": 0.1}}),
+    ("A2", "holds in part", {**IN_TIME, "sft@1": {"took": (39, 39)}, "stop_gradient@1": {"took": (77, 77)}}),
+    ("A2", "does not hold", {**IN_TIME, "sft@1": {"took": (77, 77)}, "stop_gradient@1": {"took": (39, 39)}}),
+    (
+        "A2",
+        "cannot be shown here",
+        {**IN_TIME, "sft@1": {"took": (77, 77)}, "stop_gradient@1": {"took": (77, 77)}},
+    ),
     ("A3", "holds", {**LOSES, "lora": {}, "lora+rank=4": {}, "lora+rank=64": {}}),
     ("A3", "holds in part", {**LOSES, "lora": {}, "lora+rank=4": {"right": (500, 500)}, "lora+rank=64": {}}),
     (
