@@ -335,7 +335,8 @@ def zero_shot(rates: Rates) -> Array:
 
 @metric(
     formula="share of the parameters p with |p - q| / (|q| + 1e-8) < 1e-3 at the end of stage K; q is the "
-    "pretrained value of p",
+    "pretrained value of p. Parameters without a gradient count as unchanged: the answer head, and the rows "
+    "of words that no instruction has (29 % on Fetch-v1; plain fine-tuning moves nearly all others)",
     source="ConSFT, arXiv 2605.08879, Eq. 8",
     higher_is_better=None,
     units="share of parameters",
