@@ -7,21 +7,26 @@ a negative inner product d, a step that lowers the loss would raise the distance
 gradient along the anchor's gradient is then removed: g - d / ||g_anchor||^2 g_anchor (Eq. 12 and 13).
 
 Formulas and constants are from notes by other readers of the paper. We have read its abstract only: "the
-paper" below is the paper as these notes describe it.
+paper" below is the paper as these notes describe it. Where they do not say what it does, a detail calls what
+we do "our choice".
 
 Details:
 1. The anchor is computed on the benchmark's training questions instead of 3,000 questions of VQAv2, from all
-   tokens except padding. Mean and deviation are kept per channel: the paper writes "means and variances" of a
-   layer, and its distance is exact for diagonal Gaussians.
-2. The hidden state is the output of each backbone layer. The statistics of a step come from its batch.
+   tokens except padding (our choice). Mean and deviation are kept per channel: the paper writes "means and
+   variances" of a layer, and its distance is exact for diagonal Gaussians.
+2. The hidden state is the output of each backbone layer. The statistics of a step come from its batch. Both
+   are our choice.
 3. The block of a layer holds all weights that it trains. Weights outside the backbone's layers (embeddings,
-   action head, answer head) keep the loss's gradient.
+   action head, answer head) keep the loss's gradient. Both are our choice.
 4. The paper adds eps to the norm, which leaves a small negative product. Here the division is exact, and an
    anchor gradient of norm 0 does not change the block.
-5. The distance is summed over channels and averaged over layers. Its scale cancels out of the projection.
-6. Projection comes before clipping and before Adam, so the final step need not be orthogonal.
+5. The distance is summed over channels and, by our choice, averaged over layers. Its scale cancels out of
+   the projection.
+6. Projection comes before Adam and, by our choice, before clipping, so the final step need not be orthogonal.
 7. The paper fine-tunes on one data set. In a sequence, the pretrained policy remains the anchor.
 8. The one pass over the questions is no optimiser step: no cost on the board counts it.
+9. The energy of which a share is shed is that of the gradient of the backbone's layers, by our choice. Of all
+   trained weights, the share would be smaller.
 
 `direction="random"` is the control: the same projection against a random direction. (This direction has the
 norm of the anchor's gradient, but the projection does not depend on the norm.)

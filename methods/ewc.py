@@ -2,8 +2,9 @@
 
 Details:
 1. The importance of a weight is its diagonal Fisher information: the mean over samples of the squared
-   gradient of the sample's loss. The flow-matching loss replaces the negative log-likelihood, of which it is
-   a bound, at the demonstrated actions ("empirical Fisher").
+   gradient of the sample's loss. The flow-matching loss replaces the negative log-likelihood, to which it is
+   related, at the demonstrated actions ("empirical Fisher"). Each gradient is of one draw of flow time and
+   noise: the importance also contains the variance between draws.
 2. It is computed for the retained skills before the first target, from prior demonstrations, and for each
    target after training on it. The sum of these pulls to the weights after the last target ("online" EWC, one
    anchor). All skills together have one importance, the mean over a mixture of their samples, and each target
@@ -15,7 +16,8 @@ Details:
 5. The gradient of the penalty is clipped together with the loss's, to a norm of 1, and goes through Adam: a
    strong penalty slows the target down, and `strength` does not mean what it does with plain gradient steps.
 6. The default of `strength` comes from validation episodes of the first Fetch board (docs/history.md). Where
-   methods are tuned, `clbench tune` chose again.
+   methods are tuned, `clbench tune` chose again. Published values do not compare: the loss is a mean over the
+   numbers of a chunk, 32 on Fetch-v1, so the importance is about 1,000 times smaller than that of a sum.
 7. The passes for the importance, 256 before the first target and after each, are no optimiser steps: no cost
    on the board counts them.
 """

@@ -5,7 +5,8 @@ The abstract of "Fast-dVLA" (arXiv 2603.25661) describes another paper by mistak
 of the abstract, with CapVector's equations. Two short fine-tunings on known skills, one with an auxiliary
 objective and one without, give two sets of weights; their difference is the capability vector (Eq. 3). It is
 added to the pretrained weights (Eq. 4). Plain fine-tuning follows, with a penalty on moving the weights where
-the vector is large: lambda sum_i |g_i (theta_i - theta_meta_i)| (Eq. 7 and 8).
+the vector is large: lambda sum_i |g_i (theta_i - theta_meta_i)| (Eq. 7 and 8). The aim is to learn a target
+faster, not to forget less.
 
 CapVector's equations, tables and constants are from a note by another reader, and two digests agree with it.
 We have read that paper's abstract only: "the paper" below is the paper as this note describes it. We have
@@ -19,8 +20,10 @@ Details:
    on Fetch-v1, seed 0, the two fine-tunings differ by 0.78 in norm,
    and move from the pretrained policy by 1.04 in directions with a cosine of 0.73. A scenario whose policy
    has not been pretrained on questions would test the paper's premise more directly.
-2. Both fine-tunings see the same demonstrations of all retained skills, in the same order with the same
-   draws. The paper extracts the vector on a small set of tasks; here the number of steps is small.
+2. The paper extracts the vector from a small set of data that the policy has yet to learn. Here the
+   extraction set is the demonstrations of all retained skills, which the policy has learned; the number of
+   steps is small instead. So it is our choice of data that makes the method read prior demonstrations. Both
+   fine-tunings see the same samples, in the same order with the same draws.
 3. The vector covers all parameters. None is newly initialised.
 4. theta_meta is the merged policy for all targets of the sequence; the paper fine-tunes on one target.
 5. The regulariser's gradient is added in closed form, lambda |g| sign(theta - theta_meta), with sign(0) = 0.
@@ -29,8 +32,9 @@ Details:
 7. The regulariser's gradient is clipped together with the loss's, to a norm of 1, and goes through Adam.
 8. The vector is cached. The steps that made it count in every row.
 9. Where nothing is retained, there is no skill to make a vector from: the run fails and says so.
-10. The auxiliary objective has the factor that pretraining gives questions, 1 (Spatial Forcing: 0.5), and
-   alpha is the published 1.1; neither was tuned here.
+10. Tuning chose only lambda. The auxiliary objective has the factor that pretraining gives questions, 1
+   (Spatial Forcing: 0.5), and alpha is the published 1.1. In the paper, the merge is worth more: 8.0 points
+   of LIBERO's average after 5,000 steps, and the regulariser 1.6 (Table 1).
 
 `direction="random"` is the control: a random vector with the capability vector's norm in each matrix.
 """

@@ -5,8 +5,8 @@ The learning rate is therefore kappa / sqrt(EMA(L) + eps), capped: steps are sma
 the start of a target.
 
 Details:
-1. The cap is the benchmark's own schedule instead of the paper's constant 5e-5, so that no method takes
-   larger steps than plain fine-tuning. kappa is therefore a factor of that schedule.
+1. The cap is the benchmark's own schedule instead of the paper's constant 5e-5, so that FINCH takes no larger
+   steps than plain fine-tuning. kappa is therefore a factor of that schedule.
 2. The default of kappa comes from validation episodes of the first Fetch board (docs/history.md).
    Where methods are tuned, `clbench tune` chose again.
 3. The average restarts with the first loss of each target.

@@ -2,9 +2,10 @@
 
 Details:
 1. Every linear map inside the layers of the backbone and of the action head has an adapter: queries, keys and
-   values, outputs and feed-forward. Rank 16 and alpha 32 come from AEGIS's baseline (arXiv 2604.16067), which
-   adapts the layers of the language model; here the action head is low-rank as well, and what lies outside of
-   its layers (embedding, time, position, output) stays as it is.
+   values, outputs and feed-forward. One map gives keys and values: they share its adapter and its rank. Rank
+   16 and alpha 32 come from AEGIS's baseline (arXiv 2604.16067), which adapts the layers of the language
+   model; here the action head is low-rank as well, and what lies outside of its layers (embedding, time,
+   position, output) stays as it is.
 2. One adapter is trained on all targets in turn, as in arXiv 2603.11653; the weights below it never change.
 3. `variant` is "lora", "dora" (arXiv 2402.09353) or "rslora" (arXiv 2312.03732).
 4. Adapters start from zero and must move further than full weights: `speed` multiplies the learning rate,

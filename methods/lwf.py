@@ -4,12 +4,15 @@ Details:
 1. For a flow-matching head, the distillation loss is the squared difference between the velocities that the
    policy and its frozen copy predict at the same flow time and noise. The ConSFT paper (arXiv 2605.08879,
    Table 3) defines its baseline this way. The loss is computed on the target's data: no prior data are used.
-2. The copy is made at the start of each target, as in LwF's own sequences. In the ConSFT paper it is the
+2. LwF gives each task a head of its own, and distils the heads of earlier tasks. Here one head follows all
+   instructions, and what it predicted for the target's instruction contradicts the demonstrations: the
+   distillation opposes learning by construction.
+3. The copy is made at the start of each target, as in LwF's own sequences. In the ConSFT paper it is the
    pretrained model, which is the same thing for the first target.
-3. A head that fills in masked tokens distils its expected actions, not their distribution.
-4. The distillation takes two more forward passes, one of the policy and one of its frozen copy. Both count
+4. A head that fills in masked tokens distils its expected actions, not their distribution.
+5. The distillation takes two more forward passes, one of the policy and one of its frozen copy. Both count
    in the time of a step.
-5. `strength` was chosen on validation episodes of the first Fetch board (docs/history.md).
+6. `strength` was chosen on validation episodes of the first Fetch board (docs/history.md).
 """
 
 from collections.abc import Iterable

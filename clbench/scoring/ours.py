@@ -351,7 +351,7 @@ def update_sparsity(rates: Rates) -> Array:
 @metric(
     formula="squared 2-Wasserstein distance between the hidden states of the policy and of the pretrained "
     "policy on the test questions, mean over layers, at the end of stage K",
-    source="the penalty of AEGIS, arXiv 2604.16067",
+    source="AEGIS, arXiv 2604.16067; its penalty is of the training batch, this is of questions",
     high=math.inf,
     higher_is_better=False,
     units="squared distance",

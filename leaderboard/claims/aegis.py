@@ -251,7 +251,8 @@ def keeps_answers(evidence: Evidence) -> Finding:
 @claim(
     "A5",
     AEGIS,
-    reported="0.62 % on average, at most 3.4 %; about half of the layers projected on a typical step",
+    reported="0.62 % on average, at most 3.4 % (the notes do not say of which weights' energy; here "
+    "it is that of the backbone's layers); about half of the layers projected on a typical step",
     rule="Judged in the first stage, as the paper fine-tunes on one data set. Holds if the upper end of the "
     "mean share over steps and seeds is below 0.01; does not hold if the lower end is above 0.01.",
     settled="2026-11-23T07:13Z",

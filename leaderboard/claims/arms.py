@@ -14,7 +14,8 @@ ARMS = ("consft", "consft_calibrated")
 
 LEAST_BETWEEN = 0.1
 """Share of the weights between 0.01 and 0.9, before the last tenth of the schedule, from which an arm counts.
-Below it, most samples of most steps weigh alike: almost nothing, which Adam nearly cancels, or 1."""
+Below it, most samples of most steps weigh alike: almost nothing, which Adam nearly cancels, or 1. The paper
+asks for no such share."""
 
 NEEDS_WEIGHTS = "Weights that differ between samples while the temperature is low."
 """What would change a verdict without an arm that counts."""

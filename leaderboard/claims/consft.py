@@ -52,8 +52,7 @@ CONSFT = Paper("ConSFT", ("2605.08879",))
 @claim(
     "C1",
     CONSFT,
-    reported="0.49 on prior tasks before sft, 0.09 after; about 70 % of the parameters unchanged (pi0, "
-    "LIBERO, Tables 1 and 2)",
+    reported="0.49 on prior tasks before sft, 0.09 after (pi0, LIBERO, Table 2)",
     rule="Holds if the lower end of the drop in retained success with sft at its best learning rate is above "
     "0.05; does not hold if the upper end is below 0.05.",
     settled="2026-11-23T07:13Z",
@@ -104,7 +103,7 @@ def _what_joint_says(gain: Figure) -> tuple[str, ...]:
     margin="0.20 of the retained success, the claim's own",
 )
 def keeps_20_points_more(evidence: Evidence) -> Finding:
-    """Keeps pretrained skills more than 20 points better than plain fine-tuning."""
+    """Keeps pretrained skills on average more than 20 points better than plain fine-tuning."""
     arms = arms_that_count(evidence)
     at_best = [kept(evidence, arm, "sft") for arm in ARMS]
     at_one = [kept(evidence, rung(arm, PUBLISHED), rung("sft", PUBLISHED)) for arm in ARMS]

@@ -218,7 +218,7 @@ def vector_transfers(evidence: Evidence) -> Finding:
 @claim(
     "F6",
     FAST_DVLA,
-    reported="2.65 to 3.7 times the speed of the same model without it (4.1 is relative to another model), "
+    reported="2.65 to 4.0 times the speed of the same model without it (4.1 is relative to another model), "
     "at equal success; 30 Hz on a robot",
     rule="One chunk at a time, the fastest pipeline of a distilled student against easy-first decoding in "
     "12 forwards. Holds if the lower end of the speed-up is at least 2.65 and that of the difference in "
@@ -231,7 +231,7 @@ def vector_transfers(evidence: Evidence) -> Finding:
     scenarios=ANYWHERE,
 )
 def decodes_faster(evidence: Evidence) -> Finding:
-    """A discrete-diffusion policy decodes 2.65 to 3.7 times faster at equal success."""
+    """A discrete-diffusion policy decodes 2.65 to 4.0 times faster at equal success."""
     found = read_decoding()
     if found is None or found.scenario != evidence.scenario:
         how = f"measured on {found.scenario} alone" if found else "python benchmarks/decoding.py measures it"

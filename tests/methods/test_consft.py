@@ -131,6 +131,26 @@ def test_the_scale_of_the_loss_has_the_effect_of_scaled_losses() -> None:
         torch.testing.assert_close(scaled.weights(losses, Progress(step, 100)), expected)
 
 
+@pytest.mark.parametrize(("scale", "first", "until"), [(0.01, 0.3, 97), (0.003, 1.0, 91), (0.001, 3.0, 71)])
+def test_a_scale_is_a_first_temperature_until_that_one_reaches_its_end(
+    scale: float, first: float, until: int
+) -> None:
+    losses = torch.tensor(LOSSES)
+    scaled: Any = build_method("consft_calibrated", {"loss_scale": scale})
+    started: Any = build_method("consft", {"tau_start": first})
+    for step in range(until + 1):
+        expected = started.weights(losses, Progress(step, 100))
+        torch.testing.assert_close(scaled.weights(losses, Progress(step, 100)), expected)
+    later = [method.weights(losses, Progress(until + 2, 100)) for method in (scaled, started)]
+    assert bool((later[0] > later[1]).all())
+
+
+def test_the_published_constants_give_only_losses_below_a_bound_a_weight_before_the_last_tenth() -> None:
+    method: Any = build_method("consft", {})
+    weights = method.weights(torch.tensor([0.0023, 0.0025]), Progress(1800, 2000)).tolist()
+    assert weights[0] > 0.01 > weights[1]
+
+
 def test_a_perfect_sample_weighs_1_and_a_hopeless_one_the_floor() -> None:
     method: Any = build_method("consft", {})
     losses = torch.tensor([0.0, math.inf])
