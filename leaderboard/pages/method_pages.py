@@ -9,15 +9,18 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from clbench.base.text import listed
 from clbench.learning.registry import load_method
-from clbench.runs.tuning import CONTROLS, fixed_settings, tuned, tuned_scenarios
+from clbench.runs.tuning import CONTROLS, Tuned, fixed_settings, rated_best, tuned, tuned_scenarios
 from clbench.scoring.intervals import UNBOUNDED, Estimate
 from clbench.spec.identifiers import folder_name
+from clbench.spec.references import BASELINE, FROZEN
 
 from ..board.commands import commands_of, run_command
+from ..board.frontier import FACTOR
 from ..board.rows import Row
 from ..board.runs import is_number
-from ..board.summary import DIVISIONS
+from ..board.summary import DIVISIONS, grouped
 from ..claims.aegis import SHARES
 from ..claims.evidence import SHARE, Evidence
 from ..claims.judges import Judged
@@ -114,11 +117,13 @@ def _page(method: Description, sources: Sources) -> str:
         scenario=scenario,
         rows=[sources.rows[name] for name in names] if method.name in names else [],
         shown=shown,
+        rates=_rates(method.name, sources),
         command=run_command(scenario, method.name),
         claims=_claims(method, sources),
         chosen=_chosen(method.name),
         control_of=CONTROLS.get(method.name),
         tried=[] if method.name in CONTROLS else _tried(method.name),
+        doubts=[] if method.name in CONTROLS else _doubts(method.name),
         commands=_commands(method.name, sources),
     )
 
@@ -136,6 +141,20 @@ def _diagnostics(method: Description, sources: Sources) -> dict[str, Estimate]:
 def _mean_diagnostic(method: str, name: str, sources: Sources) -> Estimate:
     span = SHARE if name in SHARES else UNBOUNDED  # as on the page of the claims
     return sources.evidence.diagnostic(method, f"{name} of {method}", name, span).estimate
+
+
+def _rates(method: str, sources: Sources) -> str:
+    """Return the sentence on the learning rates behind steps and speed, "" if they are those of sft."""
+    row, baseline = (sources.rows.get(name) for name in (method, BASELINE))
+    if row is None or baseline is None or method == FROZEN or not row.to_criterion:
+        return ""
+    own, other = (one.runs[0].record.run.settings.get(FACTOR, 1.0) for one in (row, baseline))
+    if own == other:
+        return ""
+    return (
+        f"Steps and speed also follow from the learning rate: `{FACTOR}` is {own:g} for `{method}` and "
+        f"{other:g} for `{BASELINE}`."
+    )
 
 
 # ---- claims ------------------------------------------------------------------------------------------------
@@ -171,31 +190,44 @@ def _base(label: str) -> str:
 # ---- settings ----------------------------------------------------------------------------------------------
 
 
+def _tunings(method: str) -> list[tuple[str, Tuned]]:
+    """Return the scenarios on which a method was tuned, with what tuning chose and tried."""
+    return [(scenario, found) for scenario in tuned_scenarios() if (found := tuned(scenario).get(method))]
+
+
 def _chosen(method: str) -> list[str]:
     """Return the settings that tuning chose, board by board: "`step_factor` = 0.3 on clbench/Fetch-v1"."""
-    return [
-        f"{_words(found.settings, '`{}`')} on {scenario}"
-        for scenario in tuned_scenarios()
-        if (found := tuned(scenario).get(method))
-    ]
+    return [f"{_words(found.settings, '`{}`')} on {scenario}" for scenario, found in _tunings(method)]
 
 
 def _tried(method: str) -> list[Tried]:
     """Return the settings that tuning tried, board by board."""
-    rows = []
-    for scenario in tuned_scenarios():
-        if found := tuned(scenario).get(method):
-            rows += [
-                Tried(
-                    scenario,
-                    _words(one.settings),
-                    one.learned,
-                    one.final_average,
-                    one.settings == found.settings,
-                )
-                for one in found.tried
-            ]
-    return rows
+    return [
+        Tried(scenario, _words(one.settings), one.learned, one.final_average, one.settings == found.settings)
+        for scenario, found in _tunings(method)
+        for one in found.tried
+    ]
+
+
+def _doubts(method: str) -> list[str]:
+    """Return sentences on choices that a tie or the end of a range made."""
+    sentences: list[str] = []
+    ends: list[tuple[str, str]] = []
+    for scenario, found in _tunings(method):
+        sentences += [
+            f"On {scenario}, {_words(one.settings, '`{}`')} ties with the chosen setting, was tried later, "
+            "and has no row on the board."
+            for one in rated_best(found.tried)
+            if one.settings != found.settings
+        ]
+        factors = [one.settings.get(FACTOR, 1.0) for one in found.tried]
+        for end, factor in (("smallest", min(factors)), ("largest", max(factors))):
+            if found.settings.get(FACTOR, 1.0) == factor and min(factors) < max(factors):
+                ends.append((end, scenario))
+    if ends:
+        where = listed(f"the {end} tried on {listed(scenarios)}" for end, scenarios in grouped(ends).items())
+        sentences.append(f"The chosen learning rate is {where}: a wider range might hold a better one.")
+    return sentences
 
 
 def _words(settings: Mapping[str, Any], form: str = "{}") -> str:

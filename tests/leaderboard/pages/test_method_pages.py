@@ -64,6 +64,17 @@ class Bench:
         write_record(record, record_path(self.folder / "records", SCENARIO, label, seed))
         return record
 
+    def add_to_criterion(self, method: str) -> None:
+        """Add a record with stages to a criterion."""
+        record = self.make_record(
+            [[1, 1, 0, 0, 0], [1, 0.5, 1, 0, 0], [0.5, 0.5, 1, 1, 0]],
+            groups=(2, 2, 1),
+            steps=(20,),
+            ends=(8, 20),
+            method=method,
+        )
+        write_record(record, record_path(self.folder / "records", SCENARIO, method, 0))
+
     def pages(self) -> dict[str, str]:
         """Return the pages by the name of the method."""
         output = self.folder / "docs" / "methods"
@@ -239,6 +250,102 @@ def test_the_settings_that_tuning_tried_are_listed_with_the_chosen_one(
     assert "Tuning chose" not in pages["ewc"]
     assert "Settings tried" not in pages["ewc"]
     assert "clbench tune" not in part(pages["ewc"], "Command")
+
+
+def test_steps_and_speed_are_shown_with_the_learning_rates_that_they_follow_from(bench: Bench) -> None:
+    rates = {"sft": 0.3, "fast_dvla": 0.03, "consft": 0.3, "frozen": 1.0}
+    for method in rates:
+        bench.add_to_criterion(method)
+    rows = resolve("clbench.leaderboard.board.rows:compute_board")(bench.folder / "records").rows
+    for row in rows:  # as tuning would have chosen them
+        row.runs[0].record.run.settings["step_factor"] = rates[row.method]
+    results = results_of(rows)
+    sentence = (
+        "Steps and speed also follow from the learning rate: `step_factor` is 0.03 for `fast_dvla` and 0.3 "
+        "for `sft`."
+    )
+    assert sentence in results["fast_dvla"].splitlines()
+    for method in ("consft", "sft", "frozen"):  # the same rate, sft itself, and a policy that is not trained
+        assert "| steps to criterion |" in results[method]
+        assert "follow from" not in results[method]
+    alone = results_of([row for row in rows if row.method != "sft"])["fast_dvla"]
+    assert "| steps to criterion |" in alone
+    assert "follow from" not in alone
+
+
+def results_of(rows: Any) -> dict[str, str]:
+    """Return the results on the pages that are made from rows of the board alone, by method."""
+    evidence = resolve("clbench.leaderboard.claims.evidence:Evidence")(SCENARIO, {}, ())
+    sources = resolve("clbench.leaderboard.pages.method_pages:Sources")(evidence, [], rows)
+    methods = resolve("clbench.leaderboard.views.descriptions:built_in_descriptions")()
+    pages = resolve("clbench.leaderboard.pages.method_pages:pages")(methods, sources)
+    return {one.name: part(pages[f"{one.name}.md"], "Results here") for one in methods}
+
+
+NO_TIE: dict[str, Any] = {
+    "settings": {"step_factor": 0.3},
+    "tried": (
+        Tried({"step_factor": 1.0}, 0.57, 0.9),
+        Tried({"step_factor": 0.3}, 0.58, 0.9),
+        Tried({"step_factor": 0.1}, 0.56, 0.9),
+    ),
+}
+"""What tuning of plain fine-tuning found: neither a tie, nor an end of the range."""
+
+
+def test_a_setting_that_ties_with_the_chosen_one_is_told(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scores = {1.0: (0.58, 0.94), 0.3: (0.57, 0.94), 0.1: (0.58, 0.81), 0.03: (0.58, 0.79)}
+    tried = tuple(Tried({"kappa": 0.3, "step_factor": factor}, *score) for factor, score in scores.items())
+    found = {"clbench/MetaWorld-v1": {"finch": Tuned(tried[0].settings, tried), "sft": Tuned(**NO_TIE)}}
+    monkeypatch.setattr(
+        "clbench.leaderboard.pages.method_pages.tuned", lambda scenario: found.get(scenario, {})
+    )
+    pages = bench.pages()
+    assert [line for line in pages["finch"].splitlines() if " ties " in line] == [
+        "On clbench/MetaWorld-v1, `kappa` = 0.3, `step_factor` = 0.1 ties with the chosen setting, was tried "
+        "later, and has no row on the board."
+    ]
+    assert " ties " not in pages["sft"]
+
+
+def test_a_chosen_learning_rate_at_an_end_of_those_tried_is_told(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def tuned(*scores: float) -> Tuned:
+        tried = [Tried({"step_factor": 10.0**-place}, score, 0.9) for place, score in enumerate(scores)]
+        return Tuned(max(tried, key=lambda one: one.final_average or 0.0).settings, tuple(tried))
+
+    found = {
+        "clbench/Fetch-v1": {"a_gem": tuned(0.5, 0.6, 0.7), "sft": tuned(0.6, 0.7, 0.5)},
+        "clbench/MetaWorld-v1": {"a_gem": tuned(0.7, 0.6, 0.5), "ewc": tuned(0.7, 0.6)},
+        "clbench/PointMaze-v1": {"a_gem": tuned(0.5, 0.7, 0.8), "sft": tuned(0.6)},
+    }
+    monkeypatch.setattr(
+        "clbench.leaderboard.pages.method_pages.tuned", lambda scenario: found.get(scenario, {})
+    )
+    pages = bench.pages()
+    told = {
+        name: [line for line in page.splitlines() if line.startswith("The chosen learning rate")]
+        for name, page in pages.items()
+    }
+    ends = (
+        "the smallest tried on clbench/Fetch-v1 and clbench/PointMaze-v1 and the largest tried on "
+        "clbench/MetaWorld-v1"
+    )
+    assert told["a_gem"] == [f"The chosen learning rate is {ends}: a wider range might hold a better one."]
+    assert len(told["ewc"]) == 1
+    assert told["sft"] == told["consft"] == []  # between two others or the only one; not tuned
+
+
+def test_the_tuned_files_have_the_ties_and_ends_that_the_protocol_counts(bench: Bench) -> None:
+    pages = bench.pages()
+    ties = sorted(name for name, page in pages.items() for _ in re.findall(" ties with ", page))
+    assert ties == ["finch", "finch", "lora", "sft", "stop_gradient"]
+    told = [line for page in pages.values() for line in page.splitlines() if "a wider range might" in line]
+    boards = [name for line in told for name in re.findall(r"clbench/(\w+-v1)", line)]
+    assert len([name for name in boards if name != "LiberoSpatial-v1"]) == 18
 
 
 def test_a_control_names_the_method_whose_settings_it_has_and_lists_none_of_its_trials(
