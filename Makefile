@@ -197,6 +197,8 @@ clean:
 	rm -rf .venv build dist
 
 $(BIN)/pip:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)) and \
+	  "clbench needs Python 3.11 or 3.12, not %d.%d: name one with make PYTHON=python3.12" % sys.version_info[:2])'
 	$(PYTHON) -m venv .venv
 
 # Each adds an extra. Python compiles what it imports, and keeps it: with every module compiled here, and two calls of pip

@@ -286,11 +286,14 @@ def _machine() -> dict[str, str]:
     from clbench.worlds.gl_backend import DEBIAN_PACKAGES, rendering_fault
     from clbench.worlds.threads import cores
 
-    faults = {back_end: rendering_fault(back_end) for back_end in DEBIAN_PACKAGES}
+    back_ends = tuple(DEBIAN_PACKAGES) if sys.platform == "linux" else ("glfw",)
+    faults = {back_end: rendering_fault(back_end) for back_end in back_ends}
     working = [back_end for back_end, fault in faults.items() if fault is None]
     rendering = {}
     for back_end, fault in faults.items():
-        help_ = "not needed" if working else f"apt-get install {DEBIAN_PACKAGES[back_end]}"
+        packages = DEBIAN_PACKAGES.get(back_end)
+        missing = f"apt-get install {packages}" if packages else "it needs a screen"
+        help_ = "not needed" if working else missing
         rendering[f"rendering: {back_end}"] = "works" if fault is None else f"does not work; {help_}"
     return {
         "python": sys.version.split()[0],

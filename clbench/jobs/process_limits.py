@@ -37,7 +37,8 @@ def usage(process: int) -> tuple[int, int]:
         for one in (parent, *parent.children(recursive=True)):
             with contextlib.suppress(psutil.Error):
                 memory += one.memory_info().rss
-                written += one.io_counters().write_chars if hasattr(one, "io_counters") else 0
+                counters = one.io_counters() if hasattr(one, "io_counters") else None  # not on macOS
+                written += getattr(counters, "write_chars", getattr(counters, "write_bytes", 0))
     return memory, written
 
 

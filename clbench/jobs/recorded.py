@@ -5,11 +5,12 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import os
+import platform
 from pathlib import Path
 
 from clbench.base.errors import InputError
 from clbench.records.paths import free_name
-from clbench.records.pinned import other_parts
+from clbench.records.pinned import machine_of, other_parts
 from clbench.records.reader import RecordError, UnreadableRecordError, read_record
 from clbench.records.record import Record
 from clbench.runs.spec import ResolvedRun
@@ -120,6 +121,13 @@ def _check_definition(record: Record, published: Scenario, path: Path) -> None:
     recorded = record.fingerprint.get("definition")
     other = [] if recorded is None else other_parts(recorded, definition(published))
     if other:
+        machine = machine_of(record.fingerprint)
+        if machine not in (None, platform.machine()):
+            raise InputError(
+                f"{path} was made with another {published.id}: {', '.join(other)} differ. Worlds may move "
+                f"otherwise on {machine}, where it was made, than on {platform.machine()}: choose another "
+                "folder with --records."
+            )
         raise InputError(
             f"{path} was made with another {published.id}: {', '.join(other)} differ. Give the changed "
             "scenario a new version, or choose another folder with --records."

@@ -62,3 +62,13 @@ def other_versions(recorded: Any, installed: Mapping[str, str]) -> list[str]:
         for name, version in installed.items()
         if before.get(name, version) != version
     ]
+
+
+def machine_of(fingerprint: Mapping[str, Any]) -> str | None:
+    """Return the kind of processor in a fingerprint, None if it has none that is known.
+
+    MuJoCo's builds for ARM fuse multiplications and additions, so that some worlds move otherwise there.
+    """
+    hardware = fingerprint.get("hardware")
+    found = hardware.get("machine") if isinstance(hardware, dict) else None
+    return found if found in ("x86_64", "AMD64", "aarch64", "arm64") else None

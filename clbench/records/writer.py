@@ -41,7 +41,7 @@ def write_record(record: Record, path: Path) -> None:
     text = record_text(record)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as partial:
-        with open(partial, "x", encoding="utf-8") as file:
+        with open(partial, "x", encoding="utf-8", newline="\n") as file:
             file.write(text)
         _check_readable(partial)
 

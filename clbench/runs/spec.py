@@ -206,19 +206,24 @@ def _as_json(value: Any) -> Any:
 
 
 def check_device(device: str) -> None:
-    """Refuse a device that this machine does not have.
+    """Refuse a device that this machine does not have, or on which a run does not repeat itself.
 
     Raises:
-        InputError: PyTorch does not know the name, or this machine has no such device.
+        InputError: PyTorch does not know the name, this machine has no such device, or it is neither a
+            processor nor a GPU of CUDA: Apple's `mps` has operations that differ from call to call.
     """
     import torch
 
     try:
         found = torch.device(device)
+        if found.type not in ("cpu", "cuda"):
+            raise InputError(
+                f"The device {device!r} cannot be used: runs repeat themselves on cpu and cuda alone."
+            )
         if found.type == "cuda" and (found.index or 0) < torch.cuda.device_count():
             return  # a tensor there would hold a context, which locks a GPU in exclusive mode for the workers
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).partition("\n")[0].partition(". ")[0]  # PyTorch goes on for pages
-        hint = did_you_mean(device, {"cpu", "cuda", "mps"} - {device})
+        hint = did_you_mean(device, {"cpu", "cuda"} - {device})
         raise InputError(f"The device {device!r} cannot be used: {reason.rstrip('.')}.{hint}") from error

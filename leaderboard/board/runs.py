@@ -14,7 +14,7 @@ from typing import Any
 
 from clbench.base.text import printable
 from clbench.records.paths import label_of, table_name
-from clbench.records.pinned import LATER, other_parts, pinned
+from clbench.records.pinned import LATER, machine_of, other_parts, pinned
 from clbench.records.reader import RecordError, check_home, home_of, read_record
 from clbench.records.record import EXTERNAL_USES, ONLINE_USES, Record, RunInfo, ScenarioInfo
 from clbench.runs.tuning import tuned_settings
@@ -299,7 +299,11 @@ def _unlike_the_pin(run: Run) -> str:
     """Return in which parts the definition of a run is not the pinned one, in a sentence."""
     scenario = run.record.run.scenario
     other = other_parts(_definition(run), pinned()[scenario])
-    return f"it was made with another {scenario}: {', '.join(other)} differ." if other else ""
+    if not other:
+        return ""
+    machine = machine_of(run.record.fingerprint)
+    where = f" Worlds may move otherwise on {machine}." if machine in ("aarch64", "arm64") else ""
+    return f"it was made with another {scenario}: {', '.join(other)} differ.{where}"
 
 
 def _same_parts(runs: list[Run], later: bool) -> Sifted:

@@ -135,6 +135,18 @@ def _in_doubt(subject: Subject, checks: list[Check]) -> list[Check]:
     ]
 
 
+def _other_machine(subject: Subject) -> list[str]:
+    """Return in words in what the record's machine is of another kind: ARM's MuJoCo rounds otherwise."""
+    recorded = subject.run.record.fingerprint.get("hardware")
+    values = recorded if isinstance(recorded, dict) else {}
+    here = subject.here["hardware"]
+    return [
+        f"{name} {values[name]}, {here[name]} here"
+        for name in ("system", "machine")
+        if values.get(name) not in (None, here[name])
+    ]
+
+
 def _made_with(subject: Subject, packages: Mapping[str, str]) -> list[str]:
     """Return in words which of these packages a record was made with in another version."""
     recorded = subject.run.record.fingerprint.get("versions")
@@ -197,8 +209,8 @@ def _check_simulator(subject: Subject) -> Check:
 
 
 def _differs(subject: Subject, name: str, result: str) -> Check:
-    """Return the check of what differs here: with another version of the simulator, it may be true there."""
-    other = _made_with(subject, simulator_versions(subject.scenario.tasks))
+    """Return the check of what differs here: with other packages or another machine, it may be true there."""
+    other = [*_made_with(subject, simulator_versions(subject.scenario.tasks)), *_other_machine(subject)]
     return Check(name, "; ".join([result, *other]), None if other else False)
 
 

@@ -209,7 +209,7 @@ def test_policies_that_another_command_has_made_again_meanwhile_are_not_made_twi
         ({"method": "stf"}, "Did you mean 'sft'"),
         ({"method": 3}, "A method must be a class or its name, not 3"),
         ({"scenario": None}, "scenario of a run must be a string, its id, not None"),
-        ({"device": "mps"}, "The device 'mps' cannot be used"),
+        ({"device": "mps"}, "The device 'mps' cannot be used: runs repeat themselves on cpu and cuda"),
     ],
 )
 def test_wrong_values_are_named_before_anything_runs(
