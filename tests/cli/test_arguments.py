@@ -81,7 +81,7 @@ def test_a_path_may_begin_with_the_home_folder(
             "replay must be from 0 to 1, not 7.0",
         ),
         (["run", "clbench/Fetch-v1", "sft", "--device", "gpu"], "The device 'gpu' cannot be used"),
-        (["run", "clbench/Fetch-v1", "sft", "--device", "mps"], "from the 'MPS' backend.\n"),
+        (["run", "clbench/Fetch-v1", "sft", "--device", "mps"], "repeat themselves on cpu and cuda alone.\n"),
         (["tune", "clbench/Fetch-v1", "sft", "--device", "gpu"], "The device 'gpu' cannot be used"),
         (["submit", "sft", "--device", "gpu"], "The device 'gpu' cannot be used"),
         (["run", "clbench/Fetch-v1,clbench/PointMase-v1", "sft"], "Did you mean 'clbench/PointMaze-v1'?"),
