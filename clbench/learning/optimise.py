@@ -18,10 +18,10 @@ GRADIENT_NORM = 1.0
 """Maximum norm of the gradients; they are clipped after the method has set them."""
 
 BETAS = (0.9, 0.95)
-"""Betas of AdamW, as in the three seed papers and openpi."""
+"""Betas of AdamW, as in ConSFT (arXiv 2605.08879) and openpi; notes on AEGIS and CapVector name none."""
 
 WEIGHT_DECAY = 1e-10
-"""Weight decay of AdamW, from the same sources."""
+"""Weight decay of AdamW, from the same two."""
 
 
 class MethodError(ClbenchError, RuntimeError):
