@@ -122,13 +122,11 @@ def _check_definition(record: Record, published: Scenario, path: Path) -> None:
     other = [] if recorded is None else other_parts(recorded, definition(published))
     if other:
         machine = machine_of(record.fingerprint)
-        if machine not in (None, platform.machine()):
-            raise InputError(
-                f"{path} was made with another {published.id}: {', '.join(other)} differ. Worlds may move "
-                f"otherwise on {machine}, where it was made, than on {platform.machine()}: choose another "
-                "folder with --records."
-            )
+        advice = "Give the changed scenario a new version, or choose"
+        here = platform.machine()
+        if machine not in (None, here):
+            advice = f"Worlds may move otherwise on {machine}, where it was made, than on {here}: choose"
         raise InputError(
-            f"{path} was made with another {published.id}: {', '.join(other)} differ. Give the changed "
-            "scenario a new version, or choose another folder with --records."
+            f"{path} was made with another {published.id}: {', '.join(other)} differ. {advice} "
+            "another folder with --records."
         )

@@ -322,7 +322,7 @@ def removes_drift(evidence: Evidence) -> Finding:
 
 def _on_questions(drift: Figure) -> tuple[str, ...]:
     """Return a sentence if the hidden states of questions do not certainly drift less, too."""
-    if drift.value is None or drift.high < 0.5:
+    if not drift.high >= 0.5:  # also without an interval
         return ()
     return (
         "The anchor is one of the robot's batches. The hidden states of questions, whose answers can be lost "
