@@ -1,8 +1,9 @@
 """Buffered replay: experience replay from a buffer of 2 % of the prior demonstrations.
 
-The size of the buffer comes from arXiv 2603.03818. There, 2 % of the data leave a negative backward transfer
-of 0.1 to 0.2 in vision-language-action models, where small networks have 0.4 to 0.5; 20 % nearly stop
-forgetting.
+The size of the buffer comes from arXiv 2603.03818. Its authors report that 2 % of the data can be enough for
+no forgetting in vision-language-action models. A note by another reader of the paper gives a negative
+backward transfer of 0.1 to 0.2 with 2 % (small networks: 0.4 to 0.5), and nearly none with 20 %. We have read
+its abstract only.
 
 Details:
 1. Before the first target, single time steps are drawn at random into the buffer, with replacement; all

@@ -1,8 +1,8 @@
 """FastDVLA: a capability vector is added to the pretrained weights, and an orthogonal regulariser keeps it.
 
-The abstract of "Fast-dVLA" (arXiv 2603.25661) describes another paper by mistake: the method of CapVector
-(arXiv 2605.10903). The body of Fast-dVLA accelerates discrete-diffusion policies. This class has the method
-of the abstract, with CapVector's equations. Two short fine-tunings on known skills, one with an auxiliary
+This is the method of CapVector (arXiv 2605.10903), which the abstract of "Fast-dVLA" (arXiv 2603.25661)
+describes by mistake: the body of Fast-dVLA accelerates discrete-diffusion policies. The equations are
+CapVector's. Two short fine-tunings on known skills, one with an auxiliary
 objective and one without, give two sets of weights; their difference is the capability vector (Eq. 3). It is
 added to the pretrained weights (Eq. 4). Plain fine-tuning follows, with a penalty on moving the weights where
 the vector is large: lambda sum_i |g_i (theta_i - theta_meta_i)| (Eq. 7 and 8). The aim is to learn a target
@@ -21,8 +21,8 @@ Details:
    and move from the pretrained policy by 1.04 in directions with a cosine of 0.73. A scenario whose policy
    has not been pretrained on questions would test the paper's premise more directly.
 2. The paper extracts the vector from a small set of data that the policy has yet to learn. Here the
-   extraction set is the demonstrations of all retained skills, which the policy has learned; the number of
-   steps is small instead. So it is our choice of data that makes the method read prior demonstrations. Both
+   extraction set is the demonstrations of all retained skills, which the policy has learned. The paper's
+   two trainings go on until they converge; ours are short, 150 steps each. So it is our choice of data that makes the method read prior demonstrations. Both
    fine-tunings see the same samples, in the same order with the same draws.
 3. The vector covers all parameters. None is newly initialised.
 4. theta_meta is the merged policy for all targets of the sequence; the paper fine-tunes on one target.
@@ -83,7 +83,7 @@ class FastDVLA(Method):
 
     uses = Uses(demonstrations="prepare", questions="prepare")
     needs = ("answers",)
-    metadata = Metadata(link="https://arxiv.org/abs/2603.25661")
+    metadata = Metadata(link="https://arxiv.org/abs/2605.10903")
     tunes = ("orthogonal", (1e-2, 1.0))
 
     def __post_init__(self) -> None:

@@ -118,7 +118,7 @@ def auxiliary_objective_helps(evidence: Evidence) -> Finding:
     margin="5 % of the steps",
 )
 def vector_carries_the_capability(evidence: Evidence) -> Finding:
-    """The difference of two short trainings is a vector; merged, it replaces the auxiliary objective."""
+    """The difference of two trainings on a few tasks is a vector; merged, it replaces the auxiliary objective."""
     over_sft, over_random = _of_the_vector(evidence)
     controls = (over_random, share_of_steps(evidence, CO_TRAINING, SFT))
     random_decides = over_sft.high < 0.95 or over_random.low > 0.95
