@@ -31,6 +31,7 @@ from clbench.scoring.intervals import Estimate, interval
 from clbench.scoring.layout import Array
 from clbench.scoring.metrics import load_metric
 from clbench.scoring.scores import Scores, rates_of
+from clbench.spec.references import REFERENCES
 
 RESULTS = Path(__file__).parent / "results" / "coverage.json"
 BOARDS = ("Fetch-v1", "MetaWorld-v1", "PointMaze-v1")
@@ -119,7 +120,7 @@ SEVERAL: list[Cell] = [
 
 def few_episodes(simulations: int) -> Iterator[dict[str, Any]]:
     """Yield the coverage with few episodes and the deviations of retention on MetaWorld and PointMaze."""
-    cells = list(itertools.product((4, 8), (0.12, 0.18), OTHERS))
+    cells = list(itertools.product((4, 8), (0.14, 0.24), OTHERS))
     return interval_coverage(np.random.default_rng(1), simulations, cells, FEW_EPISODES)
 
 
@@ -240,33 +241,41 @@ def board_apart(success: Outcomes, single: int = 0) -> NDArray[np.bool_]:
 def seed_deviations(records: Path) -> dict[str, dict[str, float]]:
     """Return the deviation between seeds in `records`, beyond the noise of their episodes, for some metrics.
 
-    For each metric: the number of methods with several seeds, and the root mean square and the greatest of
-    their standard deviations. What was trained elsewhere is no method.
+    For each metric: the number of methods with several seeds, the deviation of all of them in the unit of
+    `outcomes`, as if the mean rate were one half, and the greatest standard deviation of one method as it is.
+    References do not count, and neither does what was trained elsewhere: a policy that trains nothing hardly
+    varies.
     """
     runs: dict[Path, list[Scores]] = {}
     for path in sorted(records.rglob("*.json")):
         record = read_record(path)
-        if not record.run.order and not record.run.trained_elsewhere:
+        competes = not record.run.trained_elsewhere and record.run.method not in REFERENCES
+        if competes and not record.run.order:
             runs.setdefault(path.parent, []).append(Scores.from_record(record))
     found = {}
     for name in ("retention", "adaptation", "final_average"):
-        excess = np.array([_excess(name, them) for them in runs.values() if len(them) > 1])
+        pairs = [_excess(name, them) for them in runs.values() if len(them) > 1]
+        excess, at_half = np.transpose(pairs)
         found[name] = {
             "methods": len(excess),
-            "root_mean_square": round(math.sqrt(max(float(excess.mean()), 0)), 3),
+            "deviation": round(math.sqrt(max(float(excess.sum() / at_half.sum()), 0)), 3),
             "greatest": round(math.sqrt(max(float(excess.max()), 0)), 3),
         }
     return found
 
 
-def _excess(metric: str, runs: list[Scores]) -> float:
-    """Return the variance of a metric between runs less the jackknife variance of their episodes."""
+def _excess(metric: str, runs: list[Scores]) -> tuple[float, float]:
+    """Return the variance of a metric between runs less the jackknife variance of their episodes.
+
+    The second value is the variance of a success at the mean rate, divided by that at one half.
+    """
     values = load_metric(metric).function(rates_of(runs, {}))
     episodes = len(runs[0].layout.episodes)
     weights = (1 - np.eye(episodes)) * episodes / (episodes - 1)
     counts = np.broadcast_to(weights[:, None], (episodes, len(runs[0].layout.tasks), episodes))
     of_episodes = [(episodes - 1) * load_metric(metric).function(run.rates(counts)).var() for run in runs]
-    return float(values.var(ddof=1) - np.mean(of_episodes))
+    mean = float(values.mean())
+    return float(values.var(ddof=1) - np.mean(of_episodes)), 4 * mean * (1 - mean)
 
 
 # ---- tables ------------------------------------------------------------------------------------------------

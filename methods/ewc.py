@@ -6,11 +6,12 @@ Details:
    related, at the demonstrated actions ("empirical Fisher"). Each gradient is of one draw of flow time and
    noise: the importance also contains the variance between draws.
 2. It is computed for the retained skills before the first target, from prior demonstrations, and for each
-   target after training on it. The sum of these pulls to the weights after the last target ("online" EWC, arXiv
-   1805.06370, one anchor). All skills together have one importance, the mean over a mixture of their samples, and each target
-   has one of its own: with three skills, a skill counts a third as much as a target. The paper adds one
-   importance for each task. An importance is a mean over 256 samples, and noisy: six estimates for the same
-   policy have a mean correlation of 0.70, and the five largest samples carry 38 to 55 % of the sum.
+   target after training on it. The sum of these pulls to the weights after the last target ("online" EWC,
+   arXiv 1805.06370, one anchor). All skills together have one importance, the mean over a mixture of their
+   samples, and each target has one of its own: with three skills, a skill counts a third as much as a target.
+   The paper adds one importance for each task. An importance is a mean over 256 samples, and noisy: six
+   estimates for the same policy have a mean correlation of 0.70, and the five largest samples carry 38 to
+   55 % of the sum.
 3. The penalty is (strength / 2) sum_i F_i (theta_i - theta*_i)^2. Its gradient is added in closed form.
 4. If nothing is retained, no weight is important during the first target.
 5. The gradient of the penalty is clipped together with the loss's, to a norm of 1, and goes through Adam: a

@@ -22,8 +22,9 @@ Details:
    has not been pretrained on questions would test the paper's premise more directly.
 2. The paper extracts the vector from a small set of data that the policy has yet to learn. Here the
    extraction set is the demonstrations of all retained skills, which the policy has learned. The paper's
-   two trainings go on until they converge; ours are short, 150 steps each. So it is our choice of data that makes the method read prior demonstrations. Both
-   fine-tunings see the same samples, in the same order with the same draws.
+   two trainings go on until they converge; ours are short, 150 steps each. So it is our choice of data that
+   makes the method read prior demonstrations. Both fine-tunings see the same samples, in the same order with
+   the same draws.
 3. The vector covers all parameters. None is newly initialised.
 4. theta_meta is the merged policy for all targets of the sequence; the paper fine-tunes on one target.
 5. The regulariser's gradient is added in closed form, lambda |g| sign(theta - theta_meta), with sign(0) = 0.

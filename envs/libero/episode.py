@@ -73,7 +73,7 @@ class Episode:
     def _fall(self, start: NDArray[np.float64]) -> None:
         """Let things come to rest with their own mass, while the robot stands still as in `start`.
 
-        The bowl that LIBERO drops onto the ramekin stays on its rim, but bounces off it if it is twice as heavy.
+        The bowl that LIBERO drops onto the ramekin stays on its rim, but bounces off if it is twice as heavy.
         """
         model, data = self._placed(self.problem.plain), self.data
         for _ in range(FALL):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,8 +21,9 @@ def step_ratio(run: Run) -> float | None:
 
 
 def mean_step_ratio(runs: Sequence[Run]) -> float | None:
-    """Return the mean of `step_ratio` over the runs that measured it, None without one."""
-    return mean_of(map(step_ratio, runs))
+    """Return the geometric mean of `step_ratio` over the runs that measured it, None without one."""
+    known = [ratio for ratio in map(step_ratio, runs) if ratio is not None]
+    return statistics.geometric_mean(known) if known else None
 
 
 def costs_of(runs: Sequence[Run], baseline: Sequence[Run]) -> dict[str, float | None]:

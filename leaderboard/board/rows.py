@@ -16,7 +16,7 @@ import numpy as np
 
 from clbench.records.paths import check_folder
 from clbench.records.record import ScenarioInfo
-from clbench.runs.tuning import tuned
+from clbench.runs.tuning import CONTROLS, tuned
 from clbench.scoring.groups import groups
 from clbench.scoring.intervals import Estimate, Runs, estimate, row_generator
 from clbench.scoring.metric import TIE
@@ -336,13 +336,14 @@ def agreement(rows: Iterable[Row]) -> Concordance | None:
 def values_by_seed(rows: Iterable[Row], metric: str = RANKED_BY) -> dict[str, list[float]]:
     """Return a metric of each competing row with each of the baseline's seeds, by method.
 
-    Rows that lack one of these seeds, or a value, are left out. There is none without the baseline.
+    Rows that lack one of these seeds, or a value, are left out. So are controls: each is a method of the
+    board with one thing changed, and would count as one more method. There is none without the baseline.
 
     Args:
         rows: Rows of a scenario.
         metric: Name of a metric that needs no reference.
     """
-    members = competing(rows)
+    members = [row for row in competing(rows) if row.method not in CONTROLS]
     seeds = next((row.seeds for row in members if row.method == BASELINE), ())
     found = {}
     for row in members:

@@ -346,9 +346,9 @@ def _near_the_anchor(near: Figure) -> tuple[str, ...]:
     "A7",
     AEGIS,
     reported="about 40 % more time; no buffer",
-    rule="Holds if the upper end of a step's time is at most 1.6 times sft's, and stages read no prior data; "
-    "does not hold if the lower end is above 1.6, or if they read any.",
-    settled="2026-11-25T02:02Z",
+    rule="Holds if the interval of a step's time, divided by sft's, lies between 1.2 and 1.6, and stages "
+    "read no prior data; does not hold if it lies outside, or if they read any.",
+    settled="2026-11-28T20:50Z",
     margin="0.2 of the time of a step",
     scenarios=ANYWHERE,
 )
@@ -359,7 +359,12 @@ def costs_40_percent(evidence: Evidence) -> Finding:
         "throughout" in run.record.run.uses.values() for run in evidence.runs.get("aegis", {}).values()
     )
     return Finding(
-        decided(holds=time.high <= 1.6 and not buffer, fails=time.low > 1.6 or buffer),
+        decided(
+            holds=time.low >= 1.2 and time.high <= 1.6 and not buffer,
+            fails=time.low > 1.6 or time.high < 1.2 or buffer,
+        ),
         (time, evidence.cost("bytes_kept", "aegis", "bytes kept of aegis, the anchor")),
-        change="Runs whose stages read no prior data." if buffer else what_would_change(time, 1.6),
+        change="Runs whose stages read no prior data."
+        if buffer
+        else what_would_change(time, 1.2 if time.value < 1.4 else 1.6),
     )

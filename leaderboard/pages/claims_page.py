@@ -24,8 +24,9 @@ INTRODUCTION = (
     "AEGIS and CapVector say beyond their abstracts, their figures and tables included, is from notes by "
     "other readers: we have not read these papers. We have read the paper on Fast-dVLA. The rules were "
     "written before the records of these boards, but some changed later: the list says how many, each rule "
-    "says when, and docs/history.md says why. C1 was judged on clbench/LiberoSpatial-v1, and A5 on "
-    "clbench/FetchKnowledge-v1, after the first records of these boards. One review of the rules turned 15 "
+    "says when, and docs/history.md says why. C1 was judged on clbench/LiberoSpatial-v1, A5 on "
+    "clbench/FetchKnowledge-v1, A2 on clbench/Fetch-v1 and clbench/MetaWorld-v1, and A6 by another quantity, "
+    "when the records of these boards were known. One review of the rules turned 15 "
     'of 41 verdicts without a new record, 13 of them into "cannot be shown here"; docs/history.md lists '
     "them, and says that boards got more seeds after a first look. `sft` is plain fine-tuning. Most claims "
     "are judged on scenarios "

@@ -242,16 +242,19 @@ MADE_FOR_IT = "the one scenario that was made to show it, by training far past l
 
 
 def _those_that_hold(judged: Sequence[Judged]) -> str:
-    """Return in a sentence which claims hold: some are about plain fine-tuning, costs, or algebra."""
-    boards = grouped((one.claim, one.finding.verdict in ("holds", "holds in part")) for one in judged)
-    words = [
-        f"{claim.id}, {claim.words.rstrip('.')} (on "
-        + (MADE_FOR_IT if claim.scenarios == KNOWLEDGE else f"{sum(held)} of {counted(len(held), 'board')}")
-        + ")"
-        for claim, held in boards.items()
-        if any(held)
-    ]
-    return f" What holds: {'; '.join(words)}." if words else ""
+    """Return in sentences which claims hold, some in part: they may be about sft, costs, or algebra."""
+    sentences = []
+    for verdict, opening in (("holds", "What holds"), ("holds in part", "What holds in part")):
+        boards = grouped((one.claim, one.finding.verdict == verdict) for one in judged)
+        words = [
+            f"{claim.id}, {claim.words.rstrip('.')} (on "
+            + (MADE_FOR_IT if claim.scenarios == KNOWLEDGE else f"{sum(so)} of {counted(len(so), 'board')}")
+            + ")"
+            for claim, so in boards.items()
+            if any(so)
+        ]
+        sentences += [f" {opening}: {'; '.join(words)}."] if words else []
+    return "".join(sentences)
 
 
 def _ours(judged: Sequence[Judged]) -> str:

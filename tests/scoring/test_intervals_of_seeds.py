@@ -15,6 +15,7 @@ from clbench.scoring.intervals import (
     estimate,
     interval,
     interval_of_seeds,
+    mean_of_seeds,
     paired_difference,
 )
 from clbench.scoring.scores import Scores
@@ -127,6 +128,10 @@ def test_a_ratio_has_the_interval_of_its_logarithm() -> None:
     expected = np.exp([logs.mean() - reach, logs.mean() + reach])
     assert [got.low, got.high] == pytest.approx(expected)
     assert got.of_seeds
+    of_seeds = mean_of_seeds([0.12, 0.36, 0.24, 1.31], (0.0, np.inf), ratio=True)
+    assert [of_seeds.value, of_seeds.low, of_seeds.high] == pytest.approx(
+        [float(np.exp(logs.mean())), got.low, got.high]
+    )
     assert interval(0.0, np.array([0.0, 0.0]), ratio=True) == Estimate(0.0, None, None)  # no logarithm
     # a geometric mean of 0 without one of the seeds has no logarithm either: the interval is that of values
     some = np.array([0.0, 0.5, 1.0])

@@ -79,6 +79,14 @@ def test_a_row_with_fewer_seeds_takes_no_seed_from_the_others(board: Path) -> No
     assert {method: len(found) for method, found in values.items()} == {"lora": 4, "sft": 4}
 
 
+def test_a_control_does_not_count_as_one_more_method(even_board: Callable[..., Path]) -> None:
+    for method in ("sft", "consft_calibrated", "constant_weight", "shuffled_weights"):
+        records = even_board(method, 0, 0.5)
+    rows = compute_board(records).rows
+    assert len(rows) == 4
+    assert sorted(values_by_seed(rows)) == ["consft_calibrated", "sft"]
+
+
 def test_values_of_two_metrics_are_of_the_same_methods_and_seeds(board: Path) -> None:
     rows = compute_board(board).rows
     kept, finals = values_by_seed(rows, "kept"), values_by_seed(rows)
