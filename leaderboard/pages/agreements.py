@@ -71,8 +71,8 @@ def after_correction(chances: Sequence[float]) -> Iterator[str]:
         return
     stay = sum(chance < SIGNIFICANCE for chance in holm(chances))
     yield (
-        f"Of these {len(chances)} p, {below} {'is' if below == 1 else 'are'} below {SIGNIFICANCE:g}; after "
-        f"Holm's correction for their number, {stay or 'none'}."
+        f"Of these {len(chances)} p-values, {below} {'is' if below == 1 else 'are'} "
+        f"below {SIGNIFICANCE:g}; after Holm's correction for their number, {stay or 'none'}."
     )
 
 

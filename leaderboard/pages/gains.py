@@ -120,8 +120,8 @@ def _over_tied_settings(name: str, tied: Mapping[str, Sequence[TiedGain]]) -> It
             yield (
                 f"On {name}, tuning rated plain fine-tuning at {rate_text(one.factor)} as highly as at the "
                 f"chosen one. In the test episodes of {counted(one.seeds, 'seed')} it ends "
-                f"{format_interval(more, '.3f')} higher than at the chosen one, and every gain of this board "
-                "is smaller over it."
+                f"{format_interval(more, '.3f')} higher than at the chosen one, so every gain on this board "
+                "is smaller when it is measured over the tied setting."
             )
 
 
@@ -129,7 +129,7 @@ def _unlearned(rows: Iterable[Row], methods: Collection[str]) -> str:
     """Return the end of a sentence on methods some of whose stages ended without the criterion."""
     shares = {row.method: row.estimates["criterion_met"].value for row in rows if row.method in methods}
     told = [
-        f"`{method}` ended {1 - met:.0%} of its stages without the criterion"
+        f"{1 - met:.0%} of the stages of `{method}` never met the criterion"
         for method, met in shares.items()
         if met is not None and met < 1
     ]

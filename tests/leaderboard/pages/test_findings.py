@@ -122,8 +122,8 @@ def test_a_corrected_p_is_that_of_holm(chances: list[float]) -> None:
 @pytest.mark.parametrize(
     ("chances", "says"),
     [
-        ([0.016, 0.039, 0.11, 0.2, 0.6, 0.7], "Of these 6 p, 2 are below 0.05; after"),  # 6 x 0.016
-        ([0.0001, 0.0002, 0.04], "Of these 3 p, 3 are below 0.05; after"),
+        ([0.016, 0.039, 0.11, 0.2, 0.6, 0.7], "Of these 6 p-values, 2 are below 0.05; after"),  # 6 x 0.016
+        ([0.0001, 0.0002, 0.04], "Of these 3 p-values, 3 are below 0.05; after"),
         ([0.2, 0.6], None),
         ([0.01], None),
     ],
