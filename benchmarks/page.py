@@ -24,6 +24,7 @@ from clbench.records.paths import record_path
 from clbench.records.record import AnswerRow, Costs, EpisodeRow, PolicyRow, Record, RunInfo, ScenarioInfo
 from clbench.records.writer import write_record
 from clbench.spec.protocol import Split
+from clbench.spec.references import COMPARED, REFERENCES
 
 COUNTS = {"methods": 15, "seeds": 5, "scenarios": 4}
 GROUPS = {
@@ -42,8 +43,6 @@ BUDGET = {
 PUBLISHED = Path(__file__).parents[1] / "leaderboard" / "site" / "index.html"
 EMPTY = "data:text/html,<p>empty</p>"
 PAINT = "performance.getEntriesByName('first-contentful-paint')"
-REFERENCES = ("sft", "joint", "from_scratch", "frozen")
-"""Methods with which others are compared."""
 
 
 def main() -> None:
@@ -100,7 +99,7 @@ def first_text(chromium: str, address: str) -> float:
 
 def make_records(folder: Path, methods: int, seeds: int, scenarios: int) -> None:
     """Write the records of `methods` methods on each of `scenarios` scenarios with each of `seeds` seeds."""
-    names = [*REFERENCES, *(f"method_{number}" for number in range(methods))][:methods]
+    names = [*COMPARED, *(f"method_{number}" for number in range(methods))][:methods]
     for scenario, (number, method), seed in product(range(scenarios), enumerate(names), range(seeds)):
         generator = np.random.default_rng([scenario, number, seed])
         learns, keeps = np.random.default_rng([scenario, number]).random(2)
@@ -125,7 +124,7 @@ def made_record(
             split="test",
             settings={},
             changes={},
-            uses={"demonstrations": access, "questions": access, "reference": method in REFERENCES[1:]},
+            uses={"demonstrations": access, "questions": access, "reference": method in REFERENCES},
         ),
         scenario=ScenarioInfo(
             id=scenario,

@@ -26,10 +26,11 @@ from clbench.data.training_data import TrainingData
 from clbench.learning.adaptation import Step
 from clbench.learning.optimise import BETAS, GRADIENT_NORM, WEIGHT_DECAY, deterministic
 from clbench.learning.pretraining import pretrained_policy
-from clbench.learning.registry import load_method, method_names, new_method
+from clbench.learning.registry import load_method, new_method
 from clbench.learning.trainer import Trainer
 from clbench.policy.policy import Policy
-from clbench.spec.references import BASELINE
+from clbench.spec.identifiers import built_in_methods
+from clbench.spec.references import BASELINE, FROZEN
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
 
@@ -105,7 +106,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=8, help="timed steps in a block")
     arguments = parser.parse_args()
     scenario = load_scenario(arguments.scenario)
-    names = [name for name in method_names() if name != "frozen" and "/" not in name]
+    names = sorted(built_in_methods().keys() - {FROZEN})
     policy, _ = pretrained_policy(scenario, 0)
     data = TrainingData.open(scenario, policy.config)
     generator = np.random.default_rng(0)

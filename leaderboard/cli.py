@@ -274,7 +274,16 @@ def verify(
         found, records = _placed(_found(paths, records), records)
     seed = secrets.randbits(48) if seed is None else seed
     request = Request(
-        tier, episodes, seed, method, scenario, checkpoints, pretrain, by, policy, any_processor=any_processor
+        tier=tier,
+        episodes=episodes,
+        seed=seed,
+        method=method,
+        scenario=scenario,
+        checkpoints=checkpoints,
+        pretrain=pretrain,
+        by=by,
+        policy=policy,
+        any_processor=any_processor,
     )
     done = run_verifications(found, records, request, workers, Console(stderr=as_json))
     if as_json:

@@ -56,6 +56,7 @@ from clbench.learning.optimise import optimise
 from clbench.learning.prior import Prior, Uses
 from clbench.policy.batch import Batch, QuestionBatch
 from clbench.policy.policy import Policy
+from clbench.runs.fingerprint import arithmetic
 
 from ._projection import random_like
 from ._questions import with_questions
@@ -116,8 +117,7 @@ class FastDVLA(Method):
         }
         inputs = {
             "policy": hash_of_tensors(policy.state_dict()),
-            "device": str(policy.device),
-            "instructions": torch.backends.cpu.get_cpu_capability(),
+            "hardware": arithmetic(str(policy.device)),
             "drawn": hash_of_tensors(columns),
             "settings": [self.auxiliary, self.steps, self.step_size],
             "source": source_hash(__name__, *TRAINING_SOURCES),

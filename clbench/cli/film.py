@@ -94,8 +94,10 @@ def film(
         names = None if tasks is None else items_of("--tasks", tasks)
         shown = loaded.retained + loaded.target if names is None else tuple(map(loaded.task, names))
         last = len(loaded.target)
-        numbers = [0, last] if stages is None and len(runs) > 1 else _numbers("--stages", stages, last)
-        (episode,) = _numbers("--episode", str(episode), loaded.budget.validation_episodes - 1)
+        numbers = [0, last] if stages is None and len(runs) > 1 else _stages(stages, last)
+        if episode >= loaded.budget.validation_episodes:
+            last_episode = loaded.budget.validation_episodes - 1
+            raise InputError(f"--episode must be from 0 to {last_episode}, not {episode}.")
         path = output or _path(runs, names, None if stages is None else numbers, episode)
         check_format(path)
         if path.is_dir():
@@ -148,13 +150,13 @@ def _policies(
     return columns
 
 
-def _numbers(option: str, text: str | None, last: int) -> list[int]:
-    """Return the numbers from 0 to `last` that an option lists; all if it was not given."""
+def _stages(text: str | None, last: int) -> list[int]:
+    """Return the numbers from 0 to `last` that --stages lists; all if it was not given."""
     if text is None:
         return list(range(last + 1))
-    words = items_of(option, text)
+    words = items_of("--stages", text)
     if not all(word.isdecimal() and int(word) <= last for word in words):
-        raise InputError(f"{option} takes numbers from 0 to {last}, not {text}.")
+        raise InputError(f"--stages takes numbers from 0 to {last}, not {text}.")
     return [int(word) for word in words]
 
 

@@ -95,7 +95,7 @@ def tune(
     check_names([scenario], methods)
     from clbench.learning.registry import load_method
     from clbench.runs.spec import RunSpec, check_device
-    from clbench.runs.tuning import CONTROLS, check_tuned, rungs, tuned_file, write_tuned
+    from clbench.runs.tuning import CONTROL_OF, check_tuned, rungs, tuned_file, write_tuned
 
     if targets is not None:  # a run of fewer targets must not replace the record of all
         records = records / f"targets-{targets}"
@@ -124,7 +124,7 @@ def tune(
         if fixed and values:
             raise InputError("--set cannot be used with --values: give the value as --values.NAME.")
         if not values:  # their runs would choose settings that no run reads
-            names = _without_controls(names, CONTROLS, every)
+            names = _without_controls(names, CONTROL_OF, every)
         check_device(device)
         check_folders({"--records": records, "--write": write and write.parent})
         classes = {name: load_method(name) for name in names}

@@ -2,7 +2,7 @@
 
 All methods try the same number of settings, on the same seeds, all targets and validation episodes alone:
 
-1. `LADDER`: four factors of the learning rate, with the method's own strength at its default.
+1. `RUNGS`: four factors of the learning rate, with the method's own strength at its default.
 2. At the best of them two more settings: two other values of the own strength that the method declares in
    `Method.tunes`, or, if it declares none, two learning rates on both sides of the rung. Those of the lowest
    and the highest rung lie outside of the ladder: such a method may try 0.0165, which others cannot.
@@ -32,7 +32,7 @@ from clbench.spec.identifiers import folder_name, scenario_ids
 if TYPE_CHECKING:
     from clbench.learning.method import Method
 
-LADDER = (1.0, 0.3, 0.1, 0.03)
+RUNGS = (1.0, 0.3, 0.1, 0.03)
 """Factors of the learning rate, for every method."""
 
 BETWEEN = (0.55, 1.8)
@@ -41,7 +41,7 @@ BETWEEN = (0.55, 1.8)
 LEARNED = 0.8
 """Least mean success on the targets right after learning them, for a setting that may be chosen."""
 
-CONTROLS = {"constant_weight": "consft_calibrated", "shuffled_weights": "consft_calibrated"}
+CONTROL_OF = {"constant_weight": "consft_calibrated", "shuffled_weights": "consft_calibrated"}
 """Controls, with the methods that they differ from in one thing. They have the settings tuned for these, so
 that nothing else differs."""
 
@@ -81,7 +81,7 @@ def rungs(method: type[Method], fixed: Settings | None = None) -> list[dict[str,
     if clash is not None:
         raise InputError(f"Tuning {method.__name__} sets {clash}: it cannot be fixed.")
     defaults = {name: getattr(method(), name) for name in _set_by_tuning(method)}
-    return [{**fixed, **defaults, "step_factor": factor} for factor in LADDER]
+    return [{**fixed, **defaults, "step_factor": factor} for factor in RUNGS]
 
 
 def refinements(method: type[Method], best: Settings) -> list[dict[str, Any]]:
@@ -193,7 +193,7 @@ def _set_by_tuning(method: type[Method]) -> tuple[str, ...]:
 def tuned(table: str) -> Mapping[str, Tuned]:
     """Return what tuning chose for a table, by method; nothing if it was never tuned.
 
-    `CONTROLS` have what was chosen for their methods.
+    `CONTROL_OF` have what was chosen for their methods.
     """
     path = tuned_file(table)
     if not path.is_file():
@@ -202,7 +202,7 @@ def tuned(table: str) -> Mapping[str, Tuned]:
         name: Tuned(found["settings"], tuple(Tried(**one) for one in found["tried"]))
         for name, found in read_json(path)["methods"].items()
     }
-    controls = {control: methods[method] for control, method in CONTROLS.items() if method in methods}
+    controls = {control: methods[method] for control, method in CONTROL_OF.items() if method in methods}
     return {**methods, **controls}
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from clbench.records.paths import check_folder
 from clbench.records.record import ScenarioInfo
-from clbench.runs.tuning import CONTROLS, tuned
+from clbench.runs.tuning import CONTROL_OF, tuned
 from clbench.scoring.groups import groups
 from clbench.scoring.intervals import Estimate, Runs, estimate, row_generator
 from clbench.scoring.metric import TIE
@@ -343,7 +343,7 @@ def values_by_seed(rows: Iterable[Row], metric: str = RANKED_BY) -> dict[str, li
         rows: Rows of a scenario.
         metric: Name of a metric that needs no reference.
     """
-    members = [row for row in competing(rows) if row.method not in CONTROLS]
+    members = [row for row in competing(rows) if row.method not in CONTROL_OF]
     seeds = next((row.seeds for row in members if row.method == BASELINE), ())
     found = {}
     for row in members:

@@ -11,7 +11,7 @@ from typing import Any
 
 from clbench.base.text import listed
 from clbench.learning.registry import load_method
-from clbench.runs.tuning import CONTROLS, Tuned, fixed_settings, rated_best, tuned, tuned_scenarios
+from clbench.runs.tuning import CONTROL_OF, Tuned, fixed_settings, rated_best, tuned, tuned_scenarios
 from clbench.scoring.intervals import UNBOUNDED, Estimate
 from clbench.spec.identifiers import folder_name
 from clbench.spec.references import BASELINE, FROZEN
@@ -121,9 +121,9 @@ def _page(method: Description, sources: Sources) -> str:
         command=run_command(scenario, method.name),
         claims=_claims(method, sources),
         chosen=_chosen(method.name),
-        control_of=CONTROLS.get(method.name),
-        tried=[] if method.name in CONTROLS else _tried(method.name),
-        doubts=[] if method.name in CONTROLS else _doubts(method.name),
+        control_of=CONTROL_OF.get(method.name),
+        tried=[] if method.name in CONTROL_OF else _tried(method.name),
+        doubts=[] if method.name in CONTROL_OF else _doubts(method.name),
         commands=_commands(method.name, sources),
     )
 
@@ -240,7 +240,7 @@ def _commands(method: str, sources: Sources) -> list[str]:
     rows = [row for row in sources.board if row.method == method and row.scenario in scenarios]
     lines = [line for row in rows for line in commands_of(row.runs)]
     lines = lines or [run_command(sources.evidence.scenario, method)]
-    tuned_as = CONTROLS.get(method, method)
+    tuned_as = CONTROL_OF.get(method, method)
     boards = [one for one in tuned_scenarios() if method in tuned(one)]
     for one in boards:
         words = ["clbench", "tune", one, tuned_as]

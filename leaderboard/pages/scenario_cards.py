@@ -67,11 +67,12 @@ PRETRAINED = 0.90
 PRETRAINED_OF: Mapping[str, float] = {"clbench/DMControl-v0": 0.80, "clbench/FetchPixels-v0": 0.80}
 """The same bar where experts are learned, or where the policy sees pictures only."""
 
-ADAPTATION, RETENTION, FORGETTING, JOINT, FROZEN = 0.85, 0.50, 0.40, 0.07, 0.30
+LEAST_LEARNED, MOST_KEPT, LEAST_FORGOTTEN, MOST_BEHIND, MOST_UNTRAINED = 0.85, 0.50, 0.40, 0.07, 0.30
 """The other bars: fine-tuning must learn, and must forget the skills (or the earlier targets, where there are
-no skills); one policy must be able to do all tasks; and a frozen policy must not do the targets."""
+no skills); joint training, one policy for all tasks, must not be far behind; and a frozen policy must not do
+the targets."""
 
-SFT, AHEAD, REPLAY, BEFORE, CHECKS = (0.30, 0.85), 0.10, 0.90, 0.30, 8
+OF_SFT, LEAST_AHEAD, LEAST_OF_REPLAY, MOST_BEFORE, LEAST_CHECKS = (0.30, 0.85), 0.10, 0.90, 0.30, 8
 """Bars of a scenario whose stages end when the target is learned: the range of the final average of sft; how
 far experience replay must be ahead of it, and how good it must be; the success on a target before its stage;
 and the checks until a target is learned, so that their distance does not decide the result."""
@@ -186,17 +187,19 @@ class Card:
         if self.scenario.budget.criterion is not None:
             return self._bars_to_criterion()
         sft, id_ = self.rows.get("sft"), self.scenario.id
-        bars = [Bar("adaptation of sft", ADAPTATION, self._metric("adaptation", "sft"), at_least=True)]
+        bars = [Bar("adaptation of sft", LEAST_LEARNED, self._metric("adaptation", "sft"), at_least=True)]
         if self.scenario.retained:
             start = self._of_runs(sft, _retained) if sft else NO_ESTIMATE
             limit = PRETRAINED_OF.get(id_, PRETRAINED)
             bars.insert(0, Bar("pretrained policy on the retained skills", limit, start, at_least=True))
-            bars.append(Bar("retention of sft", RETENTION, self._metric("retention", "sft")))
+            bars.append(Bar("retention of sft", MOST_KEPT, self._metric("retention", "sft")))
         else:
             forgetting = self._metric("forgetting", "sft")
-            bars.append(Bar("forgetting of earlier targets by sft", FORGETTING, forgetting, at_least=True))
+            bars.append(
+                Bar("forgetting of earlier targets by sft", LEAST_FORGOTTEN, forgetting, at_least=True)
+            )
         bars.append(self._joint())
-        bars.append(Bar("adaptation of frozen", FROZEN, self._metric("adaptation", "frozen")))
+        bars.append(Bar("adaptation of frozen", MOST_UNTRAINED, self._metric("adaptation", "frozen")))
         return bars
 
     def _bars_to_criterion(self) -> list[Bar]:
@@ -208,13 +211,13 @@ class Card:
         checks = self._of_runs(sft, _checks, (0, math.inf)) if sft else NO_ESTIMATE
         ahead, above = self._difference("experience_replay", "sft"), self._difference("sft", "frozen")
         return [
-            Bar("final average of sft", SFT[0], average_of_sft, at_least=True),
-            Bar("final average of sft", SFT[1], average_of_sft),
-            Bar("final average of experience_replay", REPLAY, replay, at_least=True),
-            Bar("final average of experience_replay minus that of sft", AHEAD, ahead, at_least=True),
+            Bar("final average of sft", OF_SFT[0], average_of_sft, at_least=True),
+            Bar("final average of sft", OF_SFT[1], average_of_sft),
+            Bar("final average of experience_replay", LEAST_OF_REPLAY, replay, at_least=True),
+            Bar("final average of experience_replay minus that of sft", LEAST_AHEAD, ahead, at_least=True),
             Bar("final average of sft minus that of frozen", 0.0, above, at_least=True),
-            Bar("success of sft on a target before its stage", BEFORE, before),
-            Bar("checks of sft until a target is learned", CHECKS, checks, at_least=True),
+            Bar("success of sft on a target before its stage", MOST_BEFORE, before),
+            Bar("checks of sft until a target is learned", LEAST_CHECKS, checks, at_least=True),
         ]
 
     def _difference(self, method: str, other: str) -> Estimate:
@@ -232,12 +235,12 @@ class Card:
         values = {name: row.estimates[RANKED_BY].value for name, row in self.rows.items() if name != "joint"}
         known = {name: value for name, value in values.items() if value is not None}
         if not known or "joint" not in self.rows:
-            return Bar("best final average minus that of joint", JOINT, NO_ESTIMATE)
+            return Bar("best final average minus that of joint", MOST_BEHIND, NO_ESTIMATE)
         best = max(known, key=known.__getitem__)
         generator = row_generator(self.scenario.id, f"{best} - joint")
         runs, others = self.rows[best].scores, self.rows["joint"].scores
         words = f"best final average (of {printable(best)}) minus that of joint"
-        return Bar(words, JOINT, paired_difference(RANKED_BY, runs, others, generator))
+        return Bar(words, MOST_BEHIND, paired_difference(RANKED_BY, runs, others, generator))
 
     def _other_version(self) -> list[str]:
         """Return the fields in which the records differ from the code."""

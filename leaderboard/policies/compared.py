@@ -18,7 +18,7 @@ from ..board.summary import tables_of
 Comparisons: TypeAlias = "Mapping[str, tuple[Comparison, ...]]"
 """Comparisons of each table of another policy than the default one, by its name."""
 
-COMPARED = ("final_average", "adaptation", "retention", "kept_targets", "kept_share")
+METRICS_COMPARED = ("final_average", "adaptation", "retention", "kept_targets", "kept_share")
 """Metrics that are compared."""
 
 
@@ -65,13 +65,16 @@ def _compare(row: Row, other: Row) -> Comparison | None:
     def generator(what: str) -> np.random.Generator:
         return row_generator(f"{other.scenario} {row.method}", what)
 
-    alone = [estimate(COMPARED, runs, generator(what)) for what, runs in (("ours", ours), ("theirs", theirs))]
+    alone = [
+        estimate(METRICS_COMPARED, runs, generator(what))
+        for what, runs in (("ours", ours), ("theirs", theirs))
+    ]
     estimates = {
         name: (
             alone[0][name],
             alone[1][name],
             paired_difference(name, theirs, ours, generator(f"{name} difference")),
         )
-        for name in COMPARED
+        for name in METRICS_COMPARED
     }
     return Comparison(row.method, len(seeds), estimates)

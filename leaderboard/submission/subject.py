@@ -34,7 +34,7 @@ class Check:
     """Whether the record passed; None if this machine, or the command, cannot tell."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Request:
     """The options of a verification."""
 
@@ -44,11 +44,11 @@ class Request:
     """Number of episodes to replay; all replayable ones if there are fewer."""
     seed: int
     """Random seed that selects these episodes. The submitter must not know it."""
-    method: str | None
+    method: str | None = None
     """module:Class of a method that is not installed; the name in a record alone is never imported."""
-    scenario: str | None
+    scenario: str | None = None
     """module:id of the scenario; None if clbench registers it."""
-    checkpoints: Path | None
+    checkpoints: Path | None = None
     """Folder of kept policies; if None, they are trained again."""
     pretrain: bool = False
     """Whether the tier "retrained" repeats the pretraining, too, and reads no policy from the cache."""

@@ -13,7 +13,8 @@ from typing import Any
 
 from clbench.base.text import field_docstrings
 from clbench.learning.method import Method
-from clbench.learning.registry import load_method, method_names
+from clbench.learning.registry import load_method
+from clbench.spec.identifiers import built_in_methods
 
 from ..board.runs import division_of
 from ..board.summary import DIVISIONS
@@ -99,7 +100,7 @@ class Description:
 
 def built_in_descriptions() -> list[Description]:
     """Return the descriptions of the methods that come with clbench, by name."""
-    return [describe(name, load_method(name)) for name in method_names() if "/" not in name]
+    return [describe(name, load_method(name)) for name in sorted(built_in_methods())]
 
 
 def common_hyper_parameters() -> list[HyperParameter]:

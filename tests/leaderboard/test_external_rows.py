@@ -66,7 +66,9 @@ def test_the_page_says_what_is_declared_and_that_no_method_is_compared_with_it(
 
 def test_its_record_is_recomputed_and_cannot_be_replayed(board: Path) -> None:
     path = board / "records" / RECORD
-    *passed, last = verify(path, board / "records", Request("replayed", 10, 0, None, ID, None))
+    *passed, last = verify(
+        path, board / "records", Request(tier="replayed", episodes=10, seed=0, scenario=ID)
+    )
     assert all(check.passed for check in passed)
     expected = "a policy served from elsewhere has none, so its highest tier is recomputed"
     assert (last.passed, last.found) == (True, expected)

@@ -80,7 +80,7 @@ def test_the_page_marks_an_agent_and_shows_no_run_command_for_it(
 
 def test_the_record_of_an_agent_is_recomputed_and_cannot_be_replayed(board: Path) -> None:
     path = board / "records/Toy-v0/me--knows/seed-0.json"
-    request = Request("replayed", 10, 0, None, ID, None)
+    request = Request(tier="replayed", episodes=10, seed=0, scenario=ID)
     *passed, last = verify(path, board / "records", request)
     assert all(check.passed for check in passed)
     assert (last.passed, last.found) == (

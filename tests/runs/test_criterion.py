@@ -247,7 +247,7 @@ def test_a_record_with_a_criterion_reaches_every_tier(record: Record, tmp_path: 
     spec = RunSpec(EAGER.id, "sft", seed=0)
     write_record(record, spec.path(records))
     for tier in ("replayed", "retrained"):
-        request = subject.Request(tier, 20, 7, None, None, None)
+        request = subject.Request(tier=tier, episodes=20, seed=7)
         checks = verification.verify(spec.path(records), records, request)
         assert all(check.passed for check in checks), checks
     assert "ends of stages" in [check.name for check in checks]
@@ -262,7 +262,7 @@ def test_a_record_whose_last_check_does_not_repeat_itself_stays_recomputed(
     checks = {name: list(column) for name, column in record.checks.items()}
     checks["episodes"][-1] = 7 - checks["episodes"][-1]  # 3 episodes instead of 4, or the reverse
     write_record(replace(record, checks=checks), spec.path(tmp_path))
-    request = subject.Request("replayed", 20, 7, None, None, None)
+    request = subject.Request(tier="replayed", episodes=20, seed=7)
     found = verification.verify(spec.path(tmp_path), tmp_path, request)
     assert [check.name for check in found if not check.passed] == ["ends of stages"]
 
@@ -277,7 +277,7 @@ def test_a_made_up_check_on_the_way_and_made_up_relearning_are_found_by_the_whol
     assert record.relearning is not None
     relearning = replace(record.relearning, successes=record.relearning.successes + 1)
     write_record(replace(record, checks=checks, relearning=relearning), spec.path(tmp_path))
-    request = subject.Request("retrained", 20, 7, None, None, None)
+    request = subject.Request(tier="retrained", episodes=20, seed=7)
     found = verification.verify(spec.path(tmp_path), tmp_path, request)
     assert [check.found for check in found if not check.passed] == [
         "repeated, checks (successes), relearning (successes) differ"
@@ -290,7 +290,7 @@ def test_kept_policies_of_other_settings_under_this_name_are_found_by_going_on_f
 ) -> None:
     spec, other = RunSpec(EAGER.id, "sft", seed=0), RunSpec(EAGER.id, "sft", 0, {"step_factor": 0.2})
     honest = execute(spec, tmp_path / "records", checkpoints=tmp_path / "kept")
-    request = subject.Request("replayed", 20, 7, None, None, tmp_path / "kept")
+    request = subject.Request(tier="replayed", episodes=20, seed=7, checkpoints=tmp_path / "kept")
     found = verification.verify(spec.path(tmp_path / "records"), tmp_path / "records", request)
     assert all(check.passed for check in found), found
     assert "from stage to stage" in [check.name for check in found]
@@ -301,6 +301,6 @@ def test_kept_policies_of_other_settings_under_this_name_are_found_by_going_on_f
     for number in range(3):
         stage = other.path(tmp_path / "others_kept").with_suffix("") / f"stage-{number}"
         keep_stage(spec.resolve(), tmp_path / "forged_kept", number, stage)
-    request = subject.Request("replayed", 20, 7, None, None, tmp_path / "forged_kept")
+    request = subject.Request(tier="replayed", episodes=20, seed=7, checkpoints=tmp_path / "forged_kept")
     found = verification.verify(spec.path(tmp_path / "forged"), tmp_path / "forged", request)
     assert [check.name for check in found if not check.passed] == ["from stage to stage"]

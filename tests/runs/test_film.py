@@ -252,7 +252,7 @@ def test_a_film_of_several_methods_shows_each_after_the_last_target(
         ({"tasks": ""}, "--tasks has an empty item: ''."),
         ({"stages": "0,3"}, "--stages takes numbers from 0 to 2, not 0,3."),
         ({"stages": "last"}, "--stages takes numbers from 0 to 2, not last."),
-        ({"episode": 4}, "--episode takes numbers from 0 to 3, not 4."),
+        ({"episode": 4}, "--episode must be from 0 to 3, not 4."),
         ({"fps": 60}, "--fps must be from 1 to 50, not 60."),
         ({"output": Path("toy.avi")}, "A film is a .gif or .mp4 file, not 'toy.avi'."),
         ({"changes": {"rate": "1"}}, "sft has no hyper-parameter 'rate'"),

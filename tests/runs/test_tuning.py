@@ -17,7 +17,7 @@ from clbench.learning.registry import load_method, new_method
 from clbench.runs import tuning
 from clbench.runs.spec import RunSpec
 from clbench.runs.tuning import (
-    CONTROLS,
+    CONTROL_OF,
     Tried,
     Tuned,
     best_of,
@@ -155,13 +155,13 @@ def test_a_tuning_run_inherits_nothing_from_an_earlier_choice(toy_file: Path) ->
     assert (run.info.settings["schedule"], run.info.settings["tau_start"]) == (1.0, 0.003)
 
 
-@pytest.mark.parametrize("control", CONTROLS)
+@pytest.mark.parametrize("control", CONTROL_OF)
 def test_a_control_has_the_settings_of_its_method_and_differs_in_nothing_else(
     control: str, toy_file: Path
 ) -> None:
     chosen = Tuned({"loss_scale": 0.02, "step_factor": 0.1}, (_tried(0.6, 0.9),))
-    write_tuned(toy_file, "clbench/Toy-v0", [100, 101], {CONTROLS[control]: chosen})
-    found, method = (RunSpec(TOY, name, 0).resolve().info for name in (control, CONTROLS[control]))
+    write_tuned(toy_file, "clbench/Toy-v0", [100, 101], {CONTROL_OF[control]: chosen})
+    found, method = (RunSpec(TOY, name, 0).resolve().info for name in (control, CONTROL_OF[control]))
     assert found.settings == method.settings
     assert (found.settings["loss_scale"], found.settings["step_factor"]) == (0.02, 0.1)
     assert (found.changes, found.uses) == ({}, method.uses)

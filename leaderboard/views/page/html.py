@@ -34,6 +34,7 @@ from .charts.picture import VEGA_LITE, in_both_themes
 from .charts.plane import FULL, NARROW, WIDE, Plane, plane, template
 from .charts.vega import FONT, PALETTE, SHAPES
 from .heat import COLUMNS, heat_maps
+from .numbers import MISSING
 from .rows import MAIN
 from .view import ScenarioView, scenarios, sorted_tables, table_title
 
@@ -218,6 +219,8 @@ def _data(views: Sequence[ScenarioView]) -> dict[str, Any]:
         },
         "scenarios": {one.id: _scenario_data(one) for one in views},
         "series": SERIES,
+        "shades": SHADES,
+        "missing": MISSING,
         "planes": {name: template(size) for name, size in PLANES.items()},
     }
 

@@ -360,7 +360,7 @@
     metrics(row) {
       const rows = row.metrics.map((texts, index) => {
         const [name, description, missing] = data.scenarios[row.scenario].metrics[index];
-        return { texts: [name, ...texts], meaning: texts[0] === "–" ? `Missing: ${missing}` : description };
+        return { texts: [name, ...texts], meaning: texts[0] === data.missing ? `Missing: ${missing}` : description };
       });
       const heads = ["metric", "value [95 % interval]", ...Object.keys(row.seeds).map((seed) => `seed ${seed}`)];
       return table("All other metrics and definitions", heads, rows);
@@ -407,7 +407,7 @@
     if (seed) [...body.rows].forEach((row, stage) => [...row.cells].slice(1).forEach((cell, task) => {
       const value = seed[stage][task];
       cell.firstChild.data = text(value);
-      cell.className = cell.className.replace(/^\S+/, value === null ? "none" : `s${Math.round(value * 20)}`);
+      cell.className = cell.className.replace(/^\S+/, value === null ? "none" : `s${Math.round(value * data.shades)}`);
     }));
     for (const other of chosen.parentElement.children) other.ariaPressed = String(other === chosen);
   });
