@@ -25,7 +25,7 @@ PROMISED: dict[str, tuple[ModuleType, list[str]]] = {
     "clbench": (clbench, clbench.__all__),
     "clbench.metrics": (clbench.metrics, clbench.metrics.__all__),
     "clbench.plot": (clbench.plot, clbench.plot.__all__),
-    "clbench.testing": (clbench.testing, [name for name in clbench.testing.__all__ if "check" in name]),
+    "clbench.testing": (clbench.testing, [name for name in dir(clbench.testing) if "check" in name]),
 }
 
 
