@@ -19,7 +19,7 @@ from clbench.cli.main import COMMANDS, app
 from clbench.scoring.metrics import METRICS
 
 # docs/guide/versions.md: these may change.
-NOT_PROMISED = {*COMMANDS["Pages"], "experts"}
+NOT_PROMISED = {*COMMANDS["Pages"], "experts", "metrics --markdown"}
 
 PROMISED: dict[str, tuple[ModuleType, list[str]]] = {
     "clbench": (clbench, clbench.__all__),
@@ -86,7 +86,8 @@ def _commands(parent: App, prefix: str) -> Iterator[str]:
             continue
         yield f"{prefix} {name}"
         for argument in command.assemble_argument_collection():
-            yield from (f"{prefix} {name} {word}" for word in argument.names)
+            words = (f"{name} {word}" for word in argument.names)
+            yield from (f"{prefix} {word}" for word in words if word not in NOT_PROMISED)
         if name == "demonstrations":
             yield from _commands(command, f"{prefix} {name}")
 
