@@ -65,6 +65,7 @@ tuning: .venv/installed-libero
 	$(BIN)/clbench tune clbench/PointMaze-v1 $(filter-out $(SCHEDULED),$(MAZE)) --write methods/tuned/PointMaze-v1.json
 	$(BIN)/clbench tune clbench/PointMaze-v1 $(SCHEDULED) --set.schedule 3.25 --write methods/tuned/PointMaze-v1.json
 	$(BIN)/clbench tune clbench/LiberoSpatial-v1 experience_replay sft --write methods/tuned/LiberoSpatial-v1.json
+	$(BIN)/clbench tune clbench/LiberoSpatial-v1 $(SCHEDULED) --set.schedule 3.5 --write methods/tuned/LiberoSpatial-v1.json
 
 # Scenarios whose stages have a fixed number of steps: plain fine-tuning, replay and the references.
 FIXED := clbench/DMControl-v0,clbench/FetchPixels-v0
