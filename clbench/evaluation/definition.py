@@ -149,7 +149,7 @@ def _moments(task: Task, perturbed: bool) -> Iterator[tuple[NDArray[Any], ...]]:
                 if expert is None or step % RANDOM == RANDOM - 1:
                     action = generator.uniform(space.low, space.high)
                 else:
-                    action = np.round(expert(state) * GRID) / GRID
+                    action = np.round(np.asarray(expert(state)) * GRID) / GRID
                 after, rewards, successes = world.step([0], action[None].astype(np.float32))
                 yield state, action, rewards, successes
                 state = after[0].copy()

@@ -78,8 +78,8 @@ class RunSpec:
 
         Raises:
             UnknownNameError: There is no such scenario, method or hyper-parameter.
-            InputError: There is no such order, nothing can be perturbed, the method refuses a value, or it
-                needs an ability that the policy lacks.
+            InputError: There is no such order, nothing can be perturbed, the method refuses a value or has
+                one that a record cannot hold, or it needs an ability that the policy lacks.
         """
         from clbench.learning.registry import load_method, read_changes
         from clbench.policy.kinds import check_abilities
@@ -87,7 +87,10 @@ class RunSpec:
         scenario, published = self.scenarios()
         method = load_method(self.method)
         check_abilities(kind_of(self.policy), method.needs, self.method)
-        return ResolvedRun(self, scenario, published, method, read_changes(self.method, method, self.changes))
+        changes = read_changes(self.method, method, self.changes)
+        run = ResolvedRun(self, scenario, published, method, changes)
+        _settings_of(run.new_method())
+        return run
 
     def scenarios(self) -> tuple[Scenario, Scenario]:
         """Return the scenario with the targets that are learned, and the same in the published order.
@@ -194,15 +197,23 @@ def describe_scenario(scenario: Scenario) -> ScenarioInfo:
 
 
 def _settings_of(method: Method) -> dict[str, Any]:
-    return {name: _as_json(value) for name, value in dataclasses.asdict(method).items()}
+    """Return the hyper-parameters of a method in JSON's types.
 
-
-def _as_json(value: Any) -> Any:
-    """Return a value in JSON's types; a value that JSON cannot hold becomes text."""
-    try:
-        return json.loads(json.dumps(value, allow_nan=False))
-    except (TypeError, ValueError):
-        return repr(value)
+    Raises:
+        InputError: A record cannot hold one of them.
+    """
+    found = {}
+    for name, value in dataclasses.asdict(method).items():
+        try:
+            found[name] = json.loads(json.dumps(value, allow_nan=False))
+        except ValueError:  # an infinite number
+            found[name] = repr(value)
+        except TypeError:
+            raise InputError(
+                f"{name} of {type(method).__name__} is {value!r}, which a record cannot hold: "
+                "hyper-parameters are numbers, Booleans, texts, None, or lists of them."
+            ) from None
+    return found
 
 
 def check_device(device: str) -> None:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -74,14 +74,35 @@ def rungs(method: type[Method], fixed: Settings | None = None) -> list[dict[str,
     """Return the settings that a method tries first: the ladder of learning rates, with the fixed values.
 
     Raises:
-        InputError: A fixed hyper-parameter is one that tuning sets.
+        InputError: A fixed hyper-parameter is one that tuning sets, or the method refuses what it `tunes`.
     """
     fixed = fixed or {}
+    _check_tunes(method)
     clash = next((name for name in fixed if name in _set_by_tuning(method)), None)
     if clash is not None:
         raise InputError(f"Tuning {method.__name__} sets {clash}: it cannot be fixed.")
     defaults = {name: getattr(method(), name) for name in _set_by_tuning(method)}
     return [{**fixed, **defaults, "step_factor": factor} for factor in RUNGS]
+
+
+def _check_tunes(method: type[Method]) -> None:
+    """Refuse `tunes` that are of no use, before the runs that end with them."""
+    from clbench.learning.registry import new_method  # imports torch
+
+    match method.tunes:
+        case None:
+            return
+        case (str(field), (_, _) as values) if field in {one.name for one in fields(method)}:
+            for value in values:
+                try:
+                    new_method(method.__name__, method, {field: value})
+                except InputError as error:
+                    raise InputError(f"tunes of {method.__name__}: {error}") from error
+        case other:
+            raise InputError(
+                f"tunes of {method.__name__} must be the name of a field and two values of it, "
+                f"(name, (a, b)), not {other!r}."
+            )
 
 
 def refinements(method: type[Method], best: Settings) -> list[dict[str, Any]]:

@@ -115,14 +115,20 @@ class ServedPolicy:
 
     def _connect(self) -> ClientConnection:
         """Return a new connection whose server has sent its metadata."""
-        opening = connect(
-            self.address,
-            compression=None,
-            max_size=LARGEST_MESSAGE,
-            ping_interval=None,  # openpi's server answers none while its policy computes, or compiles
-            close_timeout=1,
-            proxy=None,  # a policy is on this machine or a near one, which proxies seldom reach
-        )
+        try:
+            opening = connect(
+                self.address,
+                compression=None,
+                max_size=LARGEST_MESSAGE,
+                ping_interval=None,  # openpi's server answers none while its policy computes, or compiles
+                close_timeout=1,
+                proxy=None,  # a policy is on this machine or a near one, which proxies seldom reach
+            )
+        except AssertionError as error:  # of websockets, where the other side speaks first, as SSH does
+            raise InputError(
+                f"The server at {self.address} does not speak openpi's protocol: it sent something before "
+                "the handshake."
+            ) from error
         with ExitStack() as opened:
             connection = opened.enter_context(opening)
             metadata = self._receive(connection)
@@ -201,6 +207,8 @@ class ServedPolicy:
                 found = f"actions of the type {actions.dtype}, {actions.shape}"
             else:
                 found = _names(reply) if isinstance(reply, dict) else type(reply).__name__
+                if actions is not None:
+                    found += f", with actions of the type {type(actions).__name__}"
             raise InputError(
                 f"The policy at {self.address} must reply with a dictionary that has an array of numbers "
                 f"called actions; it sent: {printable(found)}."

@@ -222,7 +222,7 @@ def _kept_metadata(metadata: object) -> dict[str, Any]:
 def _warn(stage: int, played: ChunkPlay) -> None:
     """Name the actions that were replaced: they are most often a fault of the program, not of the policy."""
     found = [
-        f"{100 * share:.2g} % of the steps had an action {what}"
+        f"{100 * share:.3g} % of the steps had an action {what}"
         for share, what in (
             (
                 played.not_finite,

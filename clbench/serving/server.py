@@ -210,7 +210,7 @@ def open_server(
                 try:
                     with lock:
                         reply = _answer(policy, message)
-                except Exception:  # whatever the policy raises: the client shows it
+                except (Exception, SystemExit):  # whatever the policy raises: the client shows it
                     traceback.print_exc()
                     connection.send(traceback.format_exc())
                     connection.close(1011, "The policy failed: the last message says why.")
@@ -275,7 +275,7 @@ def unpack(message: bytes) -> Any:
     try:
         return msgpack.unpackb(message, object_hook=_decode)
     except (ValueError, TypeError, KeyError, OverflowError, msgpack.exceptions.UnpackException) as error:
-        raise ValueError(f"This is no message of a policy: {error or type(error).__name__}") from error
+        raise ValueError(f"This is no message of a policy: {str(error) or type(error).__name__}") from error
 
 
 def _encode(value: Any) -> Any:

@@ -253,8 +253,11 @@ def learning(subject: Subject) -> None:
 
 
 def checkpoints(subject: Subject) -> None:
-    """Weights and normalisation are all that a checkpoint must hold."""
-    policy, batch = subject.build(3).eval(), subject.batch
+    """Weights and normalisation are all that a checkpoint must hold, after some training, too."""
+    policy, batch = subject.build(3), subject.batch
+    policy.train()
+    optimise(policy.parameters(), 2e-3, 4, lambda _: policy.action_loss(batch).mean())
+    policy.eval()
     with tempfile.TemporaryDirectory() as folder:
         save_policy(policy, Path(folder))
         loaded = load_policy(Path(folder), name=subject.config.kind).eval()

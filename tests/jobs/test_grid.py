@@ -262,7 +262,8 @@ clbench.register("me/Imported-v0", f"{__name__}:SCENARIO")
 def test_other_processes_import_the_scenario_that_the_program_imported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delitem(gymnasium.registry, "me/Imported-v0", raising=False)  # and after the test
+    monkeypatch.setitem(gymnasium.registry, "me/Imported-v0", None)  # the end of the test forgets it
+    del gymnasium.registry["me/Imported-v0"]
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "imported_scenario.py").write_text(MINE, encoding="utf-8")
@@ -274,7 +275,8 @@ def test_other_processes_import_the_scenario_that_the_program_imported(
 def test_what_a_notebook_defines_is_refused_before_anything_is_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delitem(gymnasium.registry, "me/Typed-v0", raising=False)  # and after the test
+    monkeypatch.setitem(gymnasium.registry, "me/Typed-v0", None)  # the end of the test forgets it
+    del gymnasium.registry["me/Typed-v0"]
     clbench.register("me/Typed-v0", "__main__:SCENARIO")
     with pytest.raises(ValueError, match="me/Typed-v0 is defined in a notebook or script: put it"):
         clbench.run("me/Typed-v0", "frozen", records=tmp_path)

@@ -49,6 +49,17 @@ def test_a_resolved_run_has_all_settings_of_its_record() -> None:
     assert run.protocol.target == ("down",)
 
 
+def test_a_setting_that_a_record_cannot_hold_is_refused_before_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lines = ["from dataclasses import dataclass", "from clbench import Method", "@dataclass"]
+    lines += ["class WithLoss(Method):", '    """Has a function."""', "    kind: object = print"]
+    (tmp_path / "with_function.py").write_text("\n".join(lines))
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(InputError, match=r"^kind of WithLoss is <built-in function print>, which a record"):
+        RunSpec(TOY, "with_function:WithLoss", 0).resolve()
+
+
 @pytest.mark.parametrize("text", ["0.50", "1.", "5e-1"])
 def test_a_run_by_name_has_the_path_of_its_record_however_a_value_was_typed(
     text: str, tmp_path: Path

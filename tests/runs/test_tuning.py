@@ -66,6 +66,23 @@ def test_a_method_with_its_own_strength_tries_two_values_of_it_at_the_best_rung(
     assert found == [{"strength": 0.1, "step_factor": 0.1}, {"strength": 1.0, "step_factor": 0.1}]
 
 
+@pytest.mark.parametrize(
+    ("tunes", "message"),
+    [
+        (("strength", 0.1, 10.0), r"tunes of L2SP must be the name of a field and two values of it, \(name"),
+        (("strenth", (0.1, 1.0)), "tunes of L2SP must be the name of a field"),
+        (("strength", (0.1, -1.0)), "tunes of L2SP: .*strength must be from 0, not -1"),
+    ],
+)
+def test_what_tuning_cannot_try_is_refused_before_any_run(
+    tunes: Any, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cls = load_method("l2_sp")
+    monkeypatch.setattr(cls, "tunes", tunes)
+    with pytest.raises(InputError, match=message):
+        rungs(cls)
+
+
 def test_fixed_hyper_parameters_have_the_same_value_in_all_six_settings() -> None:
     for name in ("consft", "sft"):
         cls = load_method(name)

@@ -176,7 +176,7 @@ def ending(connection: ServerConnection) -> None:
             "failed: ValueError: no key",
         ),
         (sending(pack({"action": np.zeros(2)})), r"array of numbers called actions; it sent: action"),
-        (sending(pack({"actions": "left"})), "array of numbers called actions"),
+        (sending(pack({"actions": [[0.0]]})), "it sent: actions, with actions of the type list"),
         (sending(pack({"actions": np.array([["left"]])})), r"it sent: actions of the type <U4, \(1, 1\)"),
         (sending(pack([1])), "array of numbers called actions; it sent: list"),
         (sending(pack(dict.fromkeys(map(str, range(999))))), r"it sent: 0, .*, 19, and 979 more\.$"),
@@ -238,6 +238,20 @@ def test_a_server_without_metadata_is_an_error(first: Any, message: str) -> None
         pytest.raises(InputError, match=message),
     ):
         ServedPolicy(address)
+
+
+def test_a_program_that_speaks_before_the_handshake_is_no_server_of_a_policy() -> None:
+    with socket.create_server(("localhost", 0)) as listener:
+
+        def speak() -> None:
+            with listener.accept()[0] as connection:
+                connection.sendall(b"SSH-2.0-OpenSSH_9.6\r\n")
+                connection.recv(4096)
+
+        thread = threading.Thread(target=speak, daemon=True)
+        thread.start()
+        with pytest.raises(InputError, match=r"openpi's protocol|No policy answers"):
+            ServedPolicy(f"ws://localhost:{listener.getsockname()[1]}", patience=0.1)
 
 
 def test_a_server_that_never_sends_metadata_is_an_error() -> None:

@@ -224,6 +224,20 @@ class Forgetful(Base):
         return self.scale * super().act(state, words, noise, image)
 
 
+class Averaging(Base):
+    """Keeps a number that training changes outside of its buffers."""
+
+    scale = 1.0
+
+    def action_loss(self, batch: Batch, hidden: list[Tensor] | None = None) -> Tensor:
+        self.scale *= 0.999
+        return super().action_loss(batch, hidden)
+
+    @torch.inference_mode()
+    def act(self, state: Tensor, words: Tensor, noise: Tensor, image: Tensor | None = None) -> Tensor:
+        return self.scale * super().act(state, words, noise, image)
+
+
 class Unscaled(Base):
     """Returns normalised actions."""
 
@@ -306,6 +320,7 @@ BROKEN: list[tuple[type[Policy], str, str]] = [
     (Stubborn, "learning", "a loss of at most"),
     (Unscaled, "learning", "actions in the units of the world"),
     (Forgetful, "checkpoints", "a loaded policy acts otherwise"),
+    (Averaging, "checkpoints", "a loaded policy acts otherwise"),
     (Boastful, "abilities", "telepathy"),
     (Listing, "abilities", r"a set of texts, such as abilities = frozenset\(\{"),
     (Leaking, "abilities", "gradient outside of it"),
