@@ -243,8 +243,8 @@ def seed_deviations(records: Path) -> dict[str, dict[str, float]]:
 
     For each metric: the number of methods with several seeds, the deviation of all of them in the unit of
     `outcomes`, as if the mean rate were one half, and the greatest standard deviation of one method as it is.
-    References do not count, and neither does what was trained elsewhere: a policy that trains nothing hardly
-    varies.
+    References do not count, because a policy that trains nothing hardly varies; neither do policies that were
+    trained elsewhere.
     """
     runs: dict[Path, list[Scores]] = {}
     for path in sorted(records.rglob("*.json")):

@@ -64,8 +64,8 @@ def tune(
 
     Each method runs with four learning rates, then with two values of its own strength at the best of them,
     or with two more learning rates. Runs learn all targets, with seeds that no board uses, and play no
-    test episodes. Of the settings whose success right after the
-    stages (`learned`) is at least 0.8, the one with the best final average wins. A
+    test episodes. Of the settings whose success right after the stages (`learned`) is at
+    least 0.8, the one with the best final average wins. A
     setting with a failed run, for example because the loss diverged, is not chosen.
     Runs with a record are skipped: repeat a stopped command to continue it, or to see the choice again.
 

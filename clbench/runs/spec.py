@@ -89,7 +89,7 @@ class RunSpec:
         check_abilities(kind_of(self.policy), method.needs, self.method)
         changes = read_changes(self.method, method, self.changes)
         run = ResolvedRun(self, scenario, published, method, changes)
-        _settings_of(run.new_method())
+        _settings_of(run.new_method())  # refuses a setting that no record can hold, before any work
         return run
 
     def scenarios(self) -> tuple[Scenario, Scenario]:

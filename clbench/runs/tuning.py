@@ -89,20 +89,28 @@ def _check_tunes(method: type[Method]) -> None:
     """Refuse `tunes` that are of no use, before the runs that end with them."""
     from clbench.learning.registry import new_method  # imports torch
 
+    tried = values_of_strength(method)
+    if tried is None:
+        raise InputError(
+            f"tunes of {method.__name__} must be the name of a field and two values of it, (name, (a, b)), "
+            f"not {method.tunes!r}."
+        )
+    for settings in tried:
+        try:
+            new_method(method.__name__, method, settings)
+        except InputError as error:
+            raise InputError(f"tunes of {method.__name__}: {error}") from error
+
+
+def values_of_strength(method: type[Method]) -> list[dict[str, Any]] | None:
+    """Return the values of its own strength that a method tries; None if its `tunes` have a wrong form."""
     match method.tunes:
         case None:
-            return
-        case (str(field), (_, _) as values) if field in {one.name for one in fields(method)}:
-            for value in values:
-                try:
-                    new_method(method.__name__, method, {field: value})
-                except InputError as error:
-                    raise InputError(f"tunes of {method.__name__}: {error}") from error
-        case other:
-            raise InputError(
-                f"tunes of {method.__name__} must be the name of a field and two values of it, "
-                f"(name, (a, b)), not {other!r}."
-            )
+            return []
+        case (str(name), (_, _) as values) if name in {field.name for field in fields(method)}:
+            return [{name: value} for value in values]
+        case _:
+            return None
 
 
 def refinements(method: type[Method], best: Settings) -> list[dict[str, Any]]:
@@ -214,7 +222,7 @@ def _set_by_tuning(method: type[Method]) -> tuple[str, ...]:
 def tuned(table: str) -> Mapping[str, Tuned]:
     """Return what tuning chose for a table, by method; nothing if it was never tuned.
 
-    `CONTROL_OF` have what was chosen for their methods.
+    Controls have the settings that were chosen for their methods.
     """
     path = tuned_file(table)
     if not path.is_file():

@@ -125,10 +125,7 @@ class ServedPolicy:
                 proxy=None,  # a policy is on this machine or a near one, which proxies seldom reach
             )
         except AssertionError as error:  # of websockets, where the other side speaks first, as SSH does
-            raise InputError(
-                f"The server at {self.address} does not speak openpi's protocol: it sent something before "
-                "the handshake."
-            ) from error
+            raise InvalidHandshake("it sent something before the handshake") from error
         with ExitStack() as opened:
             connection = opened.enter_context(opening)
             metadata = self._receive(connection)

@@ -26,6 +26,7 @@ from clbench.learning.method import Metadata, Method
 from clbench.learning.prior import Access, Uses
 from clbench.learning.registry import read_changes
 from clbench.policy.policy import ABILITIES
+from clbench.runs.tuning import values_of_strength
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.testing.error import Check, ContractError
 from clbench.testing.global_state import GENERATORS, same, watched
@@ -180,20 +181,15 @@ def _check_declared(cls: type[Method]) -> None:
 
 def _check_tunes(cls: type[Method]) -> None:
     """Check that tuning can try the values that `tunes` names."""
-    match cls.tunes:
-        case None:
-            return
-        case (str(name), (_, _) as values) if name in (field.name for field in dataclasses.fields(cls)):
-            try:
-                read_changes(cls.__name__, cls, {name: values[0]})
-                read_changes(cls.__name__, cls, {name: values[1]})
-            except InputError as error:
-                raise _breach(
-                    declaration, "values in tunes that the class takes", str(error), "tunes"
-                ) from error
-        case _:
-            expected = "tunes to be the name of a field and two values of it, (name, (a, b))"
-            raise _breach(declaration, expected, repr(cls.tunes), "tunes")
+    tried = values_of_strength(cls)
+    if tried is None:
+        expected = "tunes to be the name of a field and two values of it, (name, (a, b))"
+        raise _breach(declaration, expected, repr(cls.tunes), "tunes")
+    for settings in tried:
+        try:
+            read_changes(cls.__name__, cls, settings)
+        except InputError as error:
+            raise _breach(declaration, "values in tunes that the class takes", str(error), "tunes") from error
 
 
 def _check_annotated(cls: type[Method]) -> None:

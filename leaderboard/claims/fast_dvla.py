@@ -42,6 +42,11 @@ TOO_SHORT = "5 % of the steps of sft's median stage is less than one step."
 LONGER = "Targets that take plain fine-tuning at least 20 steps at the scenario's learning rate."
 
 
+def _is_too_short(stage: Figure, steps: Figure) -> bool:
+    """Return whether stages are too short for the open question whether 5 % of the steps are saved."""
+    return stage.value < FEWEST_STEPS and is_open(steps, 0.95)
+
+
 def _no_capability(evidence: Evidence) -> bool:
     """Return whether the records show that the auxiliary objective itself is no help."""
     return share_of_steps(evidence, CO_TRAINING, SFT).low > 0.95
@@ -60,7 +65,7 @@ def _why_known(evidence: Evidence) -> str:
 def _not_shown(evidence: Evidence, figure: Figure, *controls: Figure) -> Finding | None:
     """Return the finding on a board that could not show what a vector saves, else None."""
     stage = median_stage(evidence, SFT)
-    if stage.value < FEWEST_STEPS and is_open(figure, 0.95):
+    if _is_too_short(stage, figure):
         return Finding("cannot be shown here", (figure,), (*controls, stage), (TOO_SHORT,), LONGER)
     answers = question_drop(evidence, SFT)
     if loses_no_answers(answers):
@@ -90,7 +95,7 @@ def auxiliary_objective_helps(evidence: Evidence) -> Finding:
     helps, costs, known = steps.high < 0.95, time.low > 1.1, not math.isnan(steps.low)
     no_help = steps.low > 0.95
     stage, answers = median_stage(evidence, SFT), question_drop(evidence, SFT)
-    if stage.value < FEWEST_STEPS and is_open(steps, 0.95):
+    if _is_too_short(stage, steps):
         return Finding("cannot be shown here", (steps, time), (stage,), (TOO_SHORT,), LONGER)
     if loses_no_answers(answers):
         shown = (stage, answers)

@@ -250,8 +250,18 @@ def test_a_program_that_speaks_before_the_handshake_is_no_server_of_a_policy() -
 
         thread = threading.Thread(target=speak, daemon=True)
         thread.start()
-        with pytest.raises(InputError, match=r"openpi's protocol|No policy answers"):
+        with pytest.raises(InputError, match="No policy answers at"):
             ServedPolicy(f"ws://localhost:{listener.getsockname()[1]}", patience=0.1)
+
+
+def test_what_websockets_asserts_of_such_a_program_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def connect(*_: Any, **__: Any) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr("clbench.serving.client.connect", connect)
+    message = r"^No policy answers at ws://localhost:1: .*it sent something before the handshake"
+    with pytest.raises(InputError, match=message):
+        ServedPolicy("ws://localhost:1", patience=0.1)
 
 
 def test_a_server_that_never_sends_metadata_is_an_error() -> None:

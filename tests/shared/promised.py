@@ -88,8 +88,7 @@ def _commands(parent: App, prefix: str) -> Iterator[str]:
         for argument in command.assemble_argument_collection():
             words = (f"{name} {word}" for word in argument.names)
             yield from (f"{prefix} {word}" for word in words if word not in NOT_PROMISED)
-        if name == "demonstrations":
-            yield from _commands(command, f"{prefix} {name}")
+        yield from _commands(command, f"{prefix} {name}")
 
 
 if __name__ == "__main__":
