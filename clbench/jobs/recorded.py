@@ -15,7 +15,6 @@ from clbench.records.reader import RecordError, UnreadableRecordError, read_reco
 from clbench.records.record import Record
 from clbench.runs.spec import ResolvedRun
 from clbench.scoring.scores import Scores
-from clbench.spec.policies import policy_source
 from clbench.spec.scenario import Scenario
 
 
@@ -23,8 +22,8 @@ def has_record(run: ResolvedRun, records: Path) -> bool:
     """Return whether exactly this run has completed, or the same run with perturbed episodes.
 
     A record does not count if its run failed, if it cannot be read or contradicts itself, if its budget,
-    device or settings differ, or if the version of the method, or the code of a method or policy
-    "module:Class", has changed since.
+    device or settings differ, or if the version of the method, the code of a method or policy "module:Class",
+    or the weights that such a policy brings, have changed since.
 
     Raises:
         InputError: The record was made with another definition of the scenario.
@@ -66,7 +65,7 @@ def has_failed(run: ResolvedRun, records: Path) -> bool:
 
 
 def set_aside(run: ResolvedRun, records: Path) -> str | None:
-    """Rename the record of a run if it is damaged, or of older code, to do the run again.
+    """Rename the record of a run if it is damaged, or of older code or weights, to do the run again.
 
     Returns:
         A sentence that says what was wrong and where the record is now; None if there is no such record.
@@ -89,7 +88,7 @@ def set_aside(run: ResolvedRun, records: Path) -> str | None:
         changed = changed_code(record, run)
         if record.status != "success" or not changed:
             return None
-        fault, ending = f"the code of {' and '.join(changed)} has changed since", "old"
+        fault, ending = f"{' and '.join(changed)} since", "old"
     aside = free_name(path, ending)
     with contextlib.suppress(FileNotFoundError):  # another command was faster
         path.replace(aside)
@@ -97,20 +96,26 @@ def set_aside(run: ResolvedRun, records: Path) -> str | None:
 
 
 def changed_code(record: Record, run: ResolvedRun) -> list[str]:
-    """Return the names of the method and the policy, if their code is not that of a record any more.
+    """Return in words what differs from a record: the code of its method, or the code or weights of its policy.
 
     The version of a method with a name of its own says whether it is; a "module:Class" is work in progress.
     """
     from clbench.learning.registry import describe_method
+    from clbench.runs.fingerprint import describe_policy
 
     changed, method, policy = [], run.spec.method, run.spec.policy
     recorded = record.fingerprint.get("method")
     part = "source" if ":" in method else "version"
     known = recorded.get(part) if isinstance(recorded, dict) else None
     if known != describe_method(run.method)[part]:
-        changed.append(method)
-    if ":" in policy and record.fingerprint.get("policy") != policy_source(policy):
-        changed.append(policy)
+        changed.append(f"the code of {method} has changed")
+    if ":" in policy:
+        clauses = {
+            "policy": f"the code of {policy} has changed",
+            "weights": f"the weights of {policy} have changed",
+        }
+        now = describe_policy(run.scenario, run.spec.seed)
+        changed += [clauses[name] for name in now if record.fingerprint.get(name) != now[name]]
     return changed
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from clbench.base.dependencies import versions
 from clbench.base.entry_points import resolve
+from clbench.spec.policies import policy_source
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 from clbench.worlds.observation import frame_hash
@@ -79,6 +80,21 @@ def fingerprint(scenario: Scenario, device: str = "cpu") -> dict[str, Any]:
         "rollouts": {**rollouts, **frames},
         "definition": definition(scenario),
     }
+
+
+def describe_policy(scenario: Scenario, seed: int) -> dict[str, str | None]:
+    """Return what a record says of a policy class of one's own, by name of the entry in the fingerprint.
+
+    "policy" is the hash of its source, None for a built-in policy. "weights" is there only for a class that
+    brings pretrained weights: their hash, since they may lie in a file that somebody replaces.
+    """
+    source = policy_source(scenario.policy)
+    if source is None:
+        return {"policy": None}
+    from clbench.learning.pretraining import pretraining_inputs  # imports torch, see `_hardware`
+
+    inputs = pretraining_inputs(scenario, seed)
+    return {"policy": source, **{name: inputs[name] for name in ("weights",) if name in inputs}}
 
 
 def _commit() -> dict[str, Any] | None:

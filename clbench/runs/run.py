@@ -30,7 +30,7 @@ from clbench.records.paths import stage_folder
 from clbench.records.reader import read_record
 from clbench.records.record import Costs, Record
 from clbench.records.writer import check_diagnostics, write_record, write_result
-from clbench.runs.fingerprint import arithmetic, fingerprint
+from clbench.runs.fingerprint import arithmetic, describe_policy, fingerprint
 from clbench.runs.length import relearning_length, relearns, run_length
 from clbench.runs.relearning import relearn
 from clbench.runs.spec import ResolvedRun, RunSpec
@@ -38,7 +38,6 @@ from clbench.runs.stages import NOT_THE_METHOD, drop_stages, keep_stage, keeps_s
 from clbench.runs.start import evaluate_start
 from clbench.runs.step_time import step_ratio
 from clbench.runs.tensorboard import Log, require_tensorboard
-from clbench.spec.policies import policy_source
 from clbench.spec.protocol import Point
 from clbench.spec.references import BASELINE
 
@@ -115,7 +114,7 @@ def _new_record(run: ResolvedRun, trainer: Trainer) -> Record:
             # the first task of each world starts its rollout: the order of the targets must not change it
             **fingerprint(run.published, run.spec.device),
             "method": describe_method(run.method),
-            "policy": policy_source(run.spec.policy),
+            **describe_policy(run.scenario, run.spec.seed),
             "pretrained": pretrained_hash(pretrained_folder(run.scenario, run.spec.seed)),
         },
         timing={"stages": []},

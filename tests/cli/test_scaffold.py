@@ -141,14 +141,20 @@ class Own(FreshPolicy):
 """
 
 
+def own_weights(folder: Path, value: str) -> None:
+    """Write weights that `OWN` reads, and forget the module, as another process would."""
+    sys.modules.pop("own_policy", None)
+    (folder / "own_policy.py").write_text(OWN, encoding="utf-8")
+    (folder / "weights.txt").write_text(value, encoding="utf-8")
+
+
 @pytest.mark.usefixtures("fresh_policy")
 def test_runs_start_from_the_weights_that_a_policys_own_file_has_now(tmp_path: Path) -> None:
-    (tmp_path / "own_policy.py").write_text(OWN, encoding="utf-8")
+    own_weights(tmp_path, "0.5")
     scenario = load_scenario("clbench.testing:clbench/Toy-v0").with_policy("own_policy:Own")
     found = []
     for value in ("0.5", "0.25", "0.5"):
-        sys.modules.pop("own_policy", None)  # as in another process
-        (tmp_path / "weights.txt").write_text(value, encoding="utf-8")
+        own_weights(tmp_path, value)
         policy, folder = pretrained_policy(scenario, seed=0)
         assert {one for weight in policy.parameters() for one in weight.flatten().tolist()} == {float(value)}
         found.append(folder)
@@ -292,3 +298,19 @@ def test_a_record_counts_only_for_the_code_that_its_policy_has_now(fresh_policy:
     said = set_aside(spec.resolve(), records)
     assert said is not None
     assert f"the code of {fresh_policy} has changed since. It is renamed to seed-0.json.old" in said
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("fresh_policy")
+def test_a_record_counts_only_for_the_weights_that_its_policy_brings_now(tmp_path: Path) -> None:
+    own_weights(tmp_path, "0.5")
+    spec, records = RunSpec(TINY.id, "frozen", 0, policy="own_policy:Own"), tmp_path / "records"
+    execute(spec, records)
+    own_weights(tmp_path, "0.25")
+    assert not has_record(spec.resolve(), records)
+    own_weights(tmp_path, "0.5")
+    assert has_record(spec.resolve(), records)
+    own_weights(tmp_path, "0.25")
+    said = set_aside(spec.resolve(), records)
+    assert said is not None
+    assert "the weights of own_policy:Own have changed since. It is renamed to seed-0.json.old" in said
