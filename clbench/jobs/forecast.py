@@ -21,6 +21,7 @@ from clbench.policy.batch import Batch
 from clbench.policy.kinds import new_policy
 from clbench.runs.spec import ResolvedRun
 from clbench.spec.language import encode
+from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.scenario import Scenario
 
 STEPS = 8
@@ -61,10 +62,19 @@ def forecast(plan: Plan, runs: Sequence[ResolvedRun], workers: int, checkpoints:
 
 def _time(jobs: Sequence[Job], scenarios: Sequence[Scenario], at_once: int) -> str:
     slowest = max(map(step_seconds, scenarios))
+    usual = max(step_seconds(one.with_policy(DEFAULT_POLICY)) for one in scenarios)
     at_once = min(at_once, len(jobs))
+
+    def seconds_of(job: Job) -> float:
+        # lengths are in steps of the default policy where a simulator works: another policy does not change it
+        if job.function in (work.collect_demonstrations, work.collect_scenes):
+            return job.duration * usual
+        trains = job.function in (work.pretrain, work.make_policies)
+        return job.duration * (slowest if trains else max(slowest, usual))
+
     # a run waits for its policy, and the policy for demonstrations, however many workers there are
-    longest = max(chain_times(jobs).values())
-    seconds = slowest * max(sum(job.duration for job in jobs) / at_once, longest)
+    longest = max(chain_times(jobs, seconds_of).values())
+    seconds = max(sum(map(seconds_of, jobs)) / at_once, longest)
     early = any(scenario.budget.criterion for scenario in scenarios)
     return (
         f"Time: about {_duration(seconds)} with {at_once} at once, at "

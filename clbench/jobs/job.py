@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -73,11 +74,14 @@ class Job:
         return None if self.product is None else Lease(self.product.path)
 
 
-def chain_times(jobs: Iterable[Job]) -> dict[Job, float]:
-    """Return the expected time of the longest chain that begins with each job, relative to an optimiser step.
+def chain_times(
+    jobs: Iterable[Job], time_of: Callable[[Job], float] = attrgetter("duration")
+) -> dict[Job, float]:
+    """Return the expected time of the longest chain that begins with each job.
 
     Args:
         jobs: Jobs, with all jobs that they need.
+        time_of: Returns the expected time of a job, by default relative to an optimiser step.
     """
     jobs = list(jobs)
     dependents: dict[Job, list[Job]] = {job: [] for job in jobs}
@@ -87,7 +91,7 @@ def chain_times(jobs: Iterable[Job]) -> dict[Job, float]:
 
     @cache
     def time_of_chain(job: Job) -> float:
-        return max(map(time_of_chain, dependents[job]), default=0.0) + job.duration
+        return max(map(time_of_chain, dependents[job]), default=0.0) + time_of(job)
 
     return {job: time_of_chain(job) for job in jobs}
 

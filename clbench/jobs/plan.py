@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from clbench.base.entry_points import resolve
 from clbench.jobs import work
 from clbench.jobs.job import Job, Product
 from clbench.jobs.recorded import has_failed, has_record
@@ -81,7 +82,11 @@ class Plan:
             limits: Limits of the process of the run; None sets none.
             checkpoints: Folder below which the policies of all stages are kept; None keeps none.
             tensorboard: Folder below which the run is logged for TensorBoard; None logs nothing.
+
+        Raises:
+            UnknownNameError: The world or the expert of a task does not exist.
         """
+        _check_entry_points(run.scenario)
         records = records.absolute()
         folders = {
             "records": records,
@@ -210,6 +215,17 @@ class Plan:
             length = scenario.budget.demonstrations
             jobs[key] = Job(title, work.collect_demonstrations, arguments, length, self._first)
         return jobs[key]
+
+
+def _check_entry_points(scenario: Scenario) -> None:
+    """Import the worlds and experts of all tasks, so that a wrong name ends the command before the first job.
+
+    Raises:
+        UnknownNameError: One of them does not exist.
+    """
+    for task in scenario.tasks + scenario.background + scenario.scenes:
+        resolve(task.world)
+        resolve(task.expert)
 
 
 def _record_of(run: ResolvedRun, records: Path) -> Product:

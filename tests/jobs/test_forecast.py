@@ -58,6 +58,25 @@ def test_more_workers_do_not_shorten_the_longest_chain(monkeypatch: pytest.Monke
     assert time == "Time: about 7 minutes with 5 at once, at 60 ms for an optimiser step here."
 
 
+@pytest.mark.parametrize(
+    ("own", "minutes"),
+    [
+        (0.6, 10 + 100 + 100),  # a slow policy does not slow the simulator down that collects data
+        (0.006, 10 + 1 + 10),  # a fast one does not speed its episodes up
+    ],
+)
+def test_the_simulator_takes_as_long_whatever_the_policy(
+    own: float, minutes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "step_seconds", lambda scenario: 0.06 if scenario.policy == "flow" else own)
+    jobs = [_job(function, 10_000) for function in (work.collect_demonstrations, work.pretrain, work.do_run)]
+    runs = [RunSpec(TINY.id, "sft", 0, policy="discrete_diffusion").resolve()]
+    _, time, _ = forecast(_plan(*jobs), runs, 1, None)
+    hours = f"{minutes / 60:.1f} hours"
+    words = hours if minutes >= 90 else f"{minutes} minutes"
+    assert time == f"Time: about {words} with 1 at once, at {1000 * own:.0f} ms for an optimiser step here."
+
+
 def test_the_disk_is_that_of_policies_demonstrations_and_records(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "step_seconds", lambda _: 0.1)
     weights = TransformerPolicy(policy_config(TINY)).parameters()

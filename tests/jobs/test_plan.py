@@ -9,6 +9,7 @@ import pytest
 from eager import EAGER
 from tiny import TINY
 
+from clbench.base.errors import UnknownNameError
 from clbench.jobs.job import Job
 from clbench.jobs.plan import Plan
 from clbench.learning.pretraining import pretrained_policy
@@ -52,6 +53,21 @@ def test_a_job_takes_no_function_of_its_command_to_another_machine(tmp_path: Pat
         bare = job.bare()
         assert (bare.title, bare.function, bare.arguments) == (job.title, job.function, job.arguments)
         assert [name for name, value in vars(bare).items() if callable(value)] == ["function"]
+
+
+@pytest.mark.parametrize("part", ["world", "expert"])
+@pytest.mark.parametrize("group", ["target", "held_out"])
+def test_a_missing_entry_point_of_any_task_is_refused_before_the_first_job(
+    group: str, part: str, tmp_path: Path
+) -> None:
+    run = RunSpec(TINY.id, "sft", 0).resolve()
+    *first, last = getattr(run.scenario, group)
+    wrong = dataclasses.replace(last, **{part: "tiny:Missing"})
+    scenario = dataclasses.replace(run.scenario, **{group: (*first, wrong)})
+    plan = Plan()
+    with pytest.raises(UnknownNameError, match="No entry point 'tiny:Missing': module 'tiny' has no 'Missing'"):
+        plan.add_run(dataclasses.replace(run, scenario=scenario), tmp_path)
+    assert plan.jobs == []
 
 
 @pytest.mark.parametrize(
