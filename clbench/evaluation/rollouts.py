@@ -129,17 +129,28 @@ class Evaluator:
 
 
 def _check_chunks(policy: Policy, chunks: object, rows: int) -> None:
-    """Refuse actions of another shape: NumPy would repeat a single number, and take chunks for steps.
+    """Refuse actions of another shape or type.
+
+    NumPy would repeat a single number, take chunks for steps, and fail on bfloat16 or a gradient without a
+    word about the policy.
 
     Raises:
-        WrongTypeError: `act()` returned something else than a tensor (B, H, A).
+        WrongTypeError: `act()` returned something else than a float32 tensor (B, H, A) without a gradient.
     """
     wanted = (rows, policy.config.chunk, policy.config.action_size)
-    found = tuple(chunks.shape) if isinstance(chunks, torch.Tensor) else type(chunks).__name__
-    if found != wanted:
-        raise WrongTypeError(
-            f"act() of {type(policy).__name__} must return a tensor (B, H, A), here {wanted}, not {found}."
-        )
+    if not isinstance(chunks, torch.Tensor):
+        found = type(chunks).__name__
+    elif chunks.shape != wanted:
+        found = str(tuple(chunks.shape))
+    elif chunks.dtype != torch.float32:
+        found = f"one of type {str(chunks.dtype).removeprefix('torch.')} instead of float32"
+    elif chunks.requires_grad:
+        found = "one with a gradient: use @torch.inference_mode()"
+    else:
+        return
+    raise WrongTypeError(
+        f"act() of {type(policy).__name__} must return a tensor (B, H, A), here {wanted}, not {found}."
+    )
 
 
 def _begin(policy: Policy, one: Live) -> None:

@@ -199,6 +199,8 @@ def actions(subject: Subject) -> None:
     _check_shape(actions, chunk, size, "act()")
     if chunk.dtype != torch.float32:
         raise _breach(actions, "actions of type float32", str(chunk.dtype), "act()")
+    if not bool(torch.isfinite(chunk).all()):
+        raise _breach(actions, "finite actions", "some that are not", "act()")
     with _left_alone(actions, batch, "predict()"):
         _check_shape(actions, policy.predict(batch), size, "predict()")
     again = _act(policy, batch)

@@ -9,7 +9,7 @@ In a test:
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from clbench.base.entry_points import resolve
+from clbench.base.errors import ClbenchError
 from clbench.base.seeding import derive_seed
 from clbench.data.demonstrations import demonstrate
 from clbench.data.questions import QuestionKind
@@ -60,7 +61,7 @@ def check_scenario(scenario: Scenario | str, *, episodes: int = 10, success: flo
     Raises:
         InputError: The number of episodes is no whole number from 1.
         UnknownNameError: An entry point does not exist.
-        ScenarioError: Any other part is wrong.
+        ScenarioError: Any other part is wrong, or its code raises an error, which is then the cause.
     """
     if isinstance(scenario, str):
         scenario = load_scenario(scenario)
@@ -85,19 +86,37 @@ def check_scenario(scenario: Scenario | str, *, episodes: int = 10, success: flo
         raise ScenarioError(f"{scenario.id}: there is no target to learn.")
     sizes: dict[tuple[int, ...], str] = {}
     for entry_point in dict.fromkeys(task.world for task in tasks):
-        world: World = resolve(entry_point)()
+        make_world: Callable[[], World] = resolve(entry_point)
+        with _running(entry_point):
+            world = make_world()
         with closing(world):
             state, action = _check_spaces(entry_point, world)
             sizes.setdefault((*state.shape, *action.shape), entry_point)
             for task in tasks:
                 if task.world == entry_point:
-                    _check_task(task, world, episodes, success)
+                    with _running(f"task {task.name}"):
+                        _check_task(task, world, episodes, success)
     if len(sizes) > 1:
         found = ", ".join(f"{name} {size}" for size, name in sizes.items())
         raise ScenarioError(
             f"{scenario.id}: states and actions must have one size in all worlds, not {found}."
         )
     _check_questions(scenario, episodes)
+
+
+@contextmanager
+def _running(part: str) -> Iterator[None]:
+    """Turn an error that the code of a part raises into one that names the part.
+
+    Raises:
+        ScenarioError: Something else than a clause of the check failed; the error is its cause.
+    """
+    try:
+        yield
+    except (ScenarioError, ClbenchError):
+        raise
+    except Exception as error:
+        raise ScenarioError(f"{part}: {type(error).__name__}: {error}") from error
 
 
 def _check_spaces(name: str, world: World) -> tuple[spaces.Box, spaces.Box]:
@@ -225,7 +244,8 @@ def _check_questions(scenario: Scenario, episodes: int) -> None:
             raise ScenarioError(f"{where}: {error}") from error
         if len(set(kind.answers)) < 2:
             raise ScenarioError(f"{where}: it must have two answers or more, not {kind.answers}.")
-        answers = np.asarray(kind.answer(scenes))
+        with _running(where):
+            answers = np.asarray(kind.answer(scenes))
         if answers.shape != scenes.shape[:1] or answers.dtype.kind != "i":
             raise ScenarioError(f"{where}: the answers to states (N, S) must be whole numbers (N,).")
         if answers.min() < -1 or answers.max() >= len(kind.answers):
@@ -241,4 +261,7 @@ def _scenes(scenario: Scenario, episodes: int) -> Iterator[NDArray[np.float32]]:
         world: gymnasium.Env[Any, Any] = resolve(task.world)()
         with closing(world):
             for number in range(episodes):
-                yield demonstrate(world, task, derive_seed("check scene", task.name, number), True).state
+                seed = derive_seed("check scene", task.name, number)
+                with _running(f"a noisy episode of task {task.name}"):
+                    state = demonstrate(world, task, seed, True).state
+                yield state

@@ -226,3 +226,32 @@ def test_actions_of_another_shape_are_refused_with_both_shapes(cls: type[Transfo
     wanted = f"act\\(\\) of {cls.__name__} must return a tensor \\(B, H, A\\), here \\(40, .*, 2\\), not "
     with pytest.raises(WrongTypeError, match=wanted):
         Evaluator(TOY, 0).evaluate(policy, TOY.target[:1])
+
+
+class Halved(TransformerPolicy):
+    """It acts with half the digits."""
+
+    def act(self, *observed: Any) -> Any:
+        return super().act(*observed).bfloat16()
+
+
+class Learning(TransformerPolicy):
+    """Its actions have a gradient."""
+
+    def act(self, *observed: Any) -> Any:
+        return super().act(*observed).clone().requires_grad_()
+
+
+@pytest.mark.parametrize(
+    ("cls", "fault"),
+    [
+        (Halved, r"not one of type bfloat16 instead of float32\."),
+        (Learning, r"not one with a gradient: use @torch\.inference_mode\(\)\."),
+    ],
+)
+def test_actions_that_numpy_cannot_hold_are_refused_in_words_of_the_policy(
+    cls: type[TransformerPolicy], fault: str
+) -> None:
+    policy = cls(policy_config(TOY), seed=0).eval()
+    with pytest.raises(WrongTypeError, match=fault):
+        Evaluator(TOY, 0).evaluate(policy, TOY.target[:1])

@@ -169,6 +169,14 @@ class Rounded(Base):
         return super().act(state, words, noise, image).bfloat16()
 
 
+class Diverged(Base):
+    """Acts with numbers that are none."""
+
+    @torch.inference_mode()
+    def act(self, state: Tensor, words: Tensor, noise: Tensor, image: Tensor | None = None) -> Tensor:
+        return super().act(state, words, noise, image) * float("nan")
+
+
 class Listing(Plain):
     """Lists its abilities."""
 
@@ -312,6 +320,7 @@ BROKEN: list[tuple[type[Policy], str, str]] = [
     (Meddling, "losses", "it changed action in place"),
     (Shifting, "actions", "it changed state in place"),
     (Rounded, "actions", "torch.bfloat16"),
+    (Diverged, "actions", "finite actions"),
     (Short, "actions", r"\(6, 8, 2\)\n  found:    \(6, 4, 2\)"),
     (ImageBlind, "actions", "TypeError: .*act.* takes 4 positional arguments but 5 were given"),
     (Batched, "losses", r"ValueError: Expected more than 1 value(.|\n)*look at:  chunk\(\)"),

@@ -39,6 +39,20 @@ class Remembering(ToyWorld):
         return state, info
 
 
+class Broken(ToyWorld):
+    """It cannot be built."""
+
+    def __init__(self, **options: Any) -> None:
+        raise FileNotFoundError("scene.xml")
+
+
+class Stuck(ToyWorld):
+    """It fails in its first step."""
+
+    def step(self, action: Any) -> Any:
+        return {}["gripper"]
+
+
 class Alike(ToyWorld):
     """Its initial state does not depend on the seed."""
 
@@ -138,6 +152,10 @@ def long(task: str) -> Callable[[Any], Any]:
     return lambda _: np.zeros(3, np.float32)
 
 
+def broken(task: str) -> Callable[[Any], Any]:
+    return lambda _: 1 // 0
+
+
 def careless(task: str) -> Callable[[Any], Any]:
     """It cannot go down."""
     return toy_expert("up" if task == "down" else task)
@@ -155,6 +173,7 @@ LONG_ANSWER = (dataclasses.replace(TOY_QUESTIONS[0], answers=("left", "to the ri
 STRANGE_WORD = (dataclasses.replace(TOY_QUESTIONS[0], wordings=("где is it",)),)
 THIRD_ANSWER = (dataclasses.replace(TOY_QUESTIONS[0], answers=("left", "right", "up")),)
 TOO_HIGH = (dataclasses.replace(TOY_QUESTIONS[0], answer=lambda states: np.full(len(states), 2)),)
+BROKEN = (dataclasses.replace(TOY_QUESTIONS[0], answer=lambda states: states[:, 9]),)
 FLOATS = (dataclasses.replace(TOY_QUESTIONS[0], answer=fractions),)
 
 
@@ -178,6 +197,8 @@ def test_the_toy_passes() -> None:
     ("world", "message"),
     [
         ("Rounded", r"task left, step 0: the state is not in .*: it is float64 of shape \(4,\)"),
+        ("Broken", r":Broken: FileNotFoundError: scene\.xml"),
+        ("Stuck", "task left: KeyError: 'gripper'"),
         ("Remembering", "the same seed and actions give another episode after other episodes"),
         ("Alike", "all seeds have the same initial state"),
         ("Reusing", "step 0: the world gives the array of its last state again, changed: return a copy"),
@@ -200,6 +221,7 @@ def test_a_faulty_world_is_named(world: str, message: str) -> None:
     [
         ("lazy", "expert .*:lazy succeeds in 0% of 3 episodes, not in 90%"),
         ("careless", "task down: its expert .* succeeds in 0%"),
+        ("broken", "task left: ZeroDivisionError: integer division or modulo by zero"),
         ("long", "the action of .*:long must be in Box"),
     ],
 )
@@ -228,6 +250,7 @@ def test_the_expert_of_a_background_task_is_checked_too() -> None:
         ("STRANGE_WORD", "'где' in 'где is it' cannot be spelled with English letters"),
         ("THIRD_ANSWER", "'up' is never the answer"),
         ("TOO_HIGH", "answers must be from -1 to 1"),
+        ("BROKEN", "question side: IndexError: index 9 is out of bounds"),
         ("FLOATS", "must be whole numbers"),
     ],
 )
