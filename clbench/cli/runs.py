@@ -106,6 +106,7 @@ def run(
         ids = items_of("SCENARIOS", scenarios)
     check_names(ids, methods)
     from clbench.jobs.processes import at_once
+    from clbench.jobs.recorded import has_record
     from clbench.runs.spec import RunSpec, check_device
     from clbench.runs.tensorboard import require_tensorboard
     from clbench.scoring.expected_precision import expected_precision
@@ -133,7 +134,8 @@ def run(
         return
     pool = partial(_workers, workers, ray, device)
     went_well = do_runs(chosen, records, pool, checkpoints, tensorboard, quiet)
-    if not changes:  # the board shows no run with changed settings
+    # the board shows neither a run with changed settings nor one that failed
+    if not changes and (went_well or any(has_record(run, records) for run in chosen)):
         print_plain(console, _next(records))
     if not went_well:
         sys.exit(1)

@@ -120,6 +120,7 @@ def scenario_card(
         records: Folder of the records.
         output: Folder of the cards.
     """
+    from clbench.jobs.folders import check_folders
     from clbench.spec.registry import load_scenario
 
     from .scenario_cards import Card
@@ -128,6 +129,7 @@ def scenario_card(
     add_cwd_to_path()
     console = Console(stderr=True, soft_wrap=True)
     with checked_input():
+        check_folders({"--output": output})
         board = _board(records)
         names = scenarios or [
             name

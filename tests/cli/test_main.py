@@ -352,6 +352,9 @@ def test_a_stranger_runs_a_class_from_the_working_directory_and_sees_it_on_the_b
     ]
     assert "success 1.00 on the retained skills" in result.stderr
     assert "Next: clbench leaderboard\n" in result.stderr
+    broken = _clbench("run", TOY, "mine:Broken", "--seeds", "1", folder=tmp_path)
+    assert broken.returncode == 1
+    assert "Next:" not in broken.stderr  # there is nothing to see on the board
     again = _clbench("run", TOY, "mine:Gentle", "sft", "--seeds", "1", folder=tmp_path)
     assert again.returncode == 0
     assert "2 of 2 runs have a record already" in again.stderr

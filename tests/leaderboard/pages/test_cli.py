@@ -39,3 +39,13 @@ def test_without_records_the_command_for_cards_asks_for_a_scenario(
     with pytest.raises(SystemExit, match="2"):
         scenario_card(records=tmp_path, output=tmp_path / "cards")
     assert f"No scenario has records in {tmp_path}. Name one, for example " in capsys.readouterr().err
+
+
+def test_cards_for_a_folder_that_is_a_file_are_refused_before_any_expert_is_measured(
+    four_methods: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit, match="2"):
+        scenario_card(f"clbench.testing:{TOY}", records=four_methods, output=tmp_path / "file")
+    said = capsys.readouterr().err
+    assert said == f"error: --output {tmp_path / 'file'} cannot be written to: Not a directory.\n"
