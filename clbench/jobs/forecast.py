@@ -66,7 +66,7 @@ def _time(jobs: Sequence[Job], scenarios: Sequence[Scenario], at_once: int) -> s
     at_once = min(at_once, len(jobs))
 
     def seconds_of(job: Job) -> float:
-        # lengths are in steps of the default policy where a simulator works: another policy does not change it
+        # lengths are in steps of the default policy, and no policy changes the time of a simulator
         if job.function in (work.collect_demonstrations, work.collect_scenes):
             return job.duration * usual
         trains = job.function in (work.pretrain, work.make_policies)

@@ -96,7 +96,7 @@ def set_aside(run: ResolvedRun, records: Path) -> str | None:
 
 
 def changed_code(record: Record, run: ResolvedRun) -> list[str]:
-    """Return in words what differs from a record: the code of its method, or the code or weights of its policy.
+    """Return in words what has changed since a record: code of its method, or code or weights of its policy.
 
     The version of a method with a name of its own says whether it is; a "module:Class" is work in progress.
     """

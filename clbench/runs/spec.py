@@ -203,17 +203,25 @@ def _settings_of(method: Method) -> dict[str, Any]:
         InputError: A record cannot hold one of them.
     """
     found = {}
-    for name, value in dataclasses.asdict(method).items():
+    for name in (one.name for one in dataclasses.fields(method)):
+        value = getattr(method, name)
+        if not is_setting(value):
+            raise InputError(
+                f"{name} of {type(method).__name__} is {value!r}, which a record cannot hold: "
+                "hyper-parameters are numbers, Booleans, texts, None, or lists of them."
+            )
         try:
             found[name] = json.loads(json.dumps(value, allow_nan=False))
         except ValueError:  # an infinite number
             found[name] = repr(value)
-        except TypeError:
-            raise InputError(
-                f"{name} of {type(method).__name__} is {value!r}, which a record cannot hold: "
-                "hyper-parameters are numbers, Booleans, texts, None, or lists of them."
-            ) from None
     return found
+
+
+def is_setting(value: object) -> bool:
+    """Return whether a record can hold a value: a number, a Boolean, a text, None, or a list of them."""
+    if isinstance(value, list | tuple):
+        return all(map(is_setting, value))
+    return value is None or isinstance(value, bool | int | float | str)
 
 
 def check_device(device: str) -> None:

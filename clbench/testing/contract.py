@@ -15,6 +15,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import json
+import reprlib
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any, get_type_hints
@@ -26,6 +27,7 @@ from clbench.learning.method import Metadata, Method
 from clbench.learning.prior import Access, Uses
 from clbench.learning.registry import read_changes
 from clbench.policy.policy import ABILITIES
+from clbench.runs.spec import is_setting
 from clbench.runs.tuning import values_of_strength
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.testing.error import Check, ContractError
@@ -256,7 +258,7 @@ def _check_fields(cls: type[Method]) -> None:
         value = getattr(method, field.name)
         if not _is_plain(value):
             expected = "numbers, Booleans, strings, None, or lists of them as hyper-parameters"
-            raise _misbuilt(expected, f"{field.name} is a {type(value).__name__}")
+            raise _misbuilt(expected, f"{field.name} is a {type(value).__name__}, {reprlib.repr(value)}")
     if method != cls():
         expected = "equal objects from equal arguments, as in any dataclass"
         raise _misbuilt(expected, "two objects with the defaults differ")
@@ -422,10 +424,10 @@ def _breach(clause: Callable[[Subject], None], expected: str, found: str, look: 
     return ContractError(clause.__name__.replace("_", " "), expected, found, look)
 
 
-def _is_plain(value: Any) -> bool:
-    """Return whether a record can hold the value."""
+def _is_plain(value: object) -> bool:
+    """Return whether a record holds the value as it is: an infinite number becomes a text there."""
     try:
         json.dumps(value, allow_nan=False)
     except (TypeError, ValueError):
         return False
-    return True
+    return is_setting(value)

@@ -65,7 +65,9 @@ def test_a_missing_entry_point_of_any_task_is_refused_before_the_first_job(
     wrong = dataclasses.replace(last, **{part: "tiny:Missing"})
     scenario = dataclasses.replace(run.scenario, **{group: (*first, wrong)})
     plan = Plan()
-    with pytest.raises(UnknownNameError, match="No entry point 'tiny:Missing': module 'tiny' has no 'Missing'"):
+    with pytest.raises(
+        UnknownNameError, match="No entry point 'tiny:Missing': module 'tiny' has no 'Missing'"
+    ):
         plan.add_run(dataclasses.replace(run, scenario=scenario), tmp_path)
     assert plan.jobs == []
 

@@ -49,15 +49,20 @@ def test_a_resolved_run_has_all_settings_of_its_record() -> None:
     assert run.protocol.target == ("down",)
 
 
+@pytest.mark.parametrize(
+    ("default", "shown"),
+    [("print", "<built-in function print>"), ("((1, {'a': 2}),)", r"\(\(1, {'a': 2}\),\)")],
+)
 def test_a_setting_that_a_record_cannot_hold_is_refused_before_the_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    default: str, shown: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lines = ["from dataclasses import dataclass", "from clbench import Method", "@dataclass"]
-    lines += ["class WithLoss(Method):", '    """Has a function."""', "    kind: object = print"]
-    (tmp_path / "with_function.py").write_text("\n".join(lines))
+    lines += ["class WithLoss(Method):", '    """Has a strange field."""', f"    kind: object = {default}"]
+    (tmp_path / "strange_field.py").write_text("\n".join(lines))
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(InputError, match=r"^kind of WithLoss is <built-in function print>, which a record"):
-        RunSpec(TOY, "with_function:WithLoss", 0).resolve()
+    monkeypatch.delitem(sys.modules, "strange_field", raising=False)
+    with pytest.raises(InputError, match=rf"^kind of WithLoss is {shown}, which a record"):
+        RunSpec(TOY, "strange_field:WithLoss", 0).resolve()
 
 
 @pytest.mark.parametrize("text", ["0.50", "1.", "5e-1"])

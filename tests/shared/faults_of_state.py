@@ -70,6 +70,13 @@ class Loaded(Method):
     weights: Tensor = dataclasses.field(default_factory=lambda: torch.zeros(2))
 
 
+@dataclasses.dataclass
+class Named(Method):
+    """Has a dictionary as hyper-parameter."""
+
+    factors: object = dataclasses.field(default_factory=lambda: {"backbone": 0.1})
+
+
 @dataclasses.dataclass(eq=False)
 class Unequal(Method):
     """Has objects that differ."""
@@ -307,6 +314,7 @@ FAULTS_OF_STATE: list[tuple[Any, str, str, str]] = [
     (Rounding, "constructor", "to be kept unchanged", "rate=0.5 becomes 0"),
     (Capped, "constructor", "to be kept unchanged", "rounds=3 becomes 2"),
     (Loaded, "constructor", "numbers, Booleans, strings", "weights is a Tensor"),
+    (Named, "constructor", "numbers, Booleans, strings", "factors is a dict, {'backbone': 0.1}"),
     (Unequal, "constructor", "equal objects from equal arguments", "two objects with the defaults differ"),
     (Learned, "constructor", "every field to be a hyper-parameter", "anchor has init=False"),
     (
