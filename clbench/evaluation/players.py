@@ -367,7 +367,10 @@ def _numbers(action: Any, space: spaces.Box, rows: tuple[int, ...]) -> NDArray[n
     """Return actions as numbers of the shape (*rows, A)."""
     shape = (*rows, *space.shape)
     try:
-        numbers = np.asarray(action, np.float64)
+        given = np.asarray(action)
+        if given.dtype.kind in "USc":  # NumPy reads a text as a number, and drops an imaginary part
+            raise TypeError(f"of type {given.dtype}")
+        numbers = np.asarray(given, np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(
             f"The agent's action must be {space.shape[0]} numbers, not a {type(action).__name__} ({error})."

@@ -287,6 +287,8 @@ def test_the_parameters_of_a_network_that_grows_are_those_at_the_end(evaluate: C
         (lambda _: {"arm": 1}, ValueError, r"must be 2 numbers, not a dict \(.+\)"),
         (lambda _: torch.zeros(2).bfloat16(), ValueError, r"2 numbers, not a Tensor \(.*BFloat16\)"),
         (lambda _: "left", ValueError, "must be 2 numbers, not a str"),
+        (lambda _: ["0.5", "1"], ValueError, r"must be 2 numbers, not a list \(of type <U3\)"),
+        (lambda _: np.array([1j, 1]), ValueError, r"2 numbers, not a ndarray \(of type complex128\)"),
         (3, TypeError, "int is not an agent"),
     ],
 )
