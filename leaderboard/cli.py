@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from rich.console import Console
-from rich.text import Text
 
 from clbench.base.entry_points import unknown
 from clbench.base.errors import InputError, UnknownNameError
-from clbench.base.text import counted, printable
+from clbench.base.text import counted, print_plain, printable
 from clbench.cli.arguments import (
     AsJson,
     MethodName,
@@ -83,11 +82,11 @@ def show(
     if published:
         with checked_input():
             added = add_published(records)
-        messages.print(Text(f"{counted(added, 'published record')} added to {records}."))
+        print_plain(messages, f"{counted(added, 'published record')} added to {records}.")
     if not any(records.rglob("*.json")):
         message = f"There are no records in {records}. Make some first: clbench run {SCENARIO} sft\n"
         message += "Or look at the published ones: clbench leaderboard --published"
-        messages.print(Text(message))
+        print_plain(messages, message)
         raise SystemExit(2)
     inputs = inputs_of(records)
     board = read_unchanged(records, inputs)
@@ -111,12 +110,12 @@ def show(
     if written:
         print_written(written)
     else:
-        console.print(Text(f"Unchanged: {site_of(records)}"), soft_wrap=True)
+        print_plain(console, f"Unchanged: {site_of(records)}")
 
 
 def _print_not_shown(board: Summary, console: Console) -> None:
     for entry in board.not_shown:
-        console.print(Text(printable(f"Not shown: {entry}")))
+        print_plain(console, printable(f"Not shown: {entry}"))
 
 
 def _computed(records: Path) -> Board:
@@ -207,7 +206,7 @@ def submit(
             written = write_site(board, records, inputs)
         print_written(written)
         lines = placement(board, runs[0], records)
-        Console().print(Text("\n".join(lines)), soft_wrap=True)
+        print_plain(Console(), "\n".join(lines))
     if not went_well:
         raise SystemExit(1)
 

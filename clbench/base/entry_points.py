@@ -44,7 +44,7 @@ def import_module(module: str, needed_for: str) -> Any:
 
     Raises:
         UnknownNameError: The module, or a module that it imports, does not exist.
-        InputError: A module that is not part of clbench raises an error while it is imported.
+        InputError: A module that is not part of clbench raises an error or exits while it is imported.
     """
     near = module.removeprefix("./").removesuffix(".py").replace("/", ".")
     hint = f" Did you mean {near + needed_for.removeprefix(module)!r}?" if near != module else ""
@@ -58,7 +58,7 @@ def import_module(module: str, needed_for: str) -> Any:
         raise UnknownNameError(
             f"No module {error.name!r} can be imported for {needed_for!r}.{hint}"
         ) from error
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # a script without `if __name__ == "__main__"` may exit
         if module.partition(".")[0] == "clbench":  # a bug of ours shows its traceback
             raise
         what = f"{type(error).__name__}: {error}"

@@ -52,8 +52,8 @@ def megabytes(count: int) -> str:
 
 
 def print_plain(console: Console, text: str, style: str | None = None) -> None:
-    """Print text as it is: `rich` changes no bracket, colours no word and breaks no line of it."""
-    console.print(text, style=style, highlight=False, markup=False, soft_wrap=True)
+    """Print text as it is: `rich` changes no [name] and no :name:, colours no word and breaks no line."""
+    console.print(text, style=style, highlight=False, markup=False, emoji=False, soft_wrap=True)
 
 
 def listed(parts: Iterable[str]) -> str:

@@ -7,10 +7,12 @@ from collections.abc import Iterator
 from itertools import takewhile
 from traceback import walk_tb
 from types import FrameType, FunctionType
+from typing import Any
 
 from clbench.base.source import names_in
 from clbench.base.text import did_you_mean
-from clbench.learning.method import Method
+from clbench.learning.method import Metadata, Method
+from clbench.learning.prior import Uses
 
 HOOKS = (
     "watch_pretraining",
@@ -51,15 +53,42 @@ def uncalled_functions(cls: type[Method]) -> dict[str, str]:
 
 
 def misfits(cls: type[Method]) -> dict[str, tuple[str, str]]:
-    """Return the hooks that the loop cannot call, each with its arguments in `Method` and in the class."""
+    """Return the hooks that the loop cannot call, each with its arguments in `Method` and in the class.
+
+    A value in the place of a hook, such as a field of its name, is "the value 0.5".
+    """
     found = {}
     for hook in HOOKS:
-        given, taken = (inspect.signature(getattr(one, hook)) for one in (Method, cls))
+        given, own = inspect.signature(getattr(Method, hook)).parameters, getattr(cls, hook)
+        arguments = f"({', '.join(given)})"
+        if not callable(own):
+            found[hook] = arguments, f"the value {own!r}"
+            continue
+        taken = inspect.signature(own)
         try:
-            taken.bind(*given.parameters)
+            taken.bind(*given)
         except TypeError:
-            found[hook] = (", ".join(given.parameters), ", ".join(taken.parameters))
+            found[hook] = arguments, f"({', '.join(taken.parameters)})"
     return found
+
+
+DECLARATIONS: dict[str, tuple[Any, str]] = {
+    "uses": (Uses, "a Uses"),
+    "metadata": (Metadata, "a Metadata"),
+    "tunes": (tuple | None, "a tuple, the name of a hyper-parameter and two values of it, or None"),
+    "needs": (tuple, "a tuple of abilities of a policy"),
+    "whole_stages": (bool, "a bool"),
+}
+"""Types of the declarations of a class besides its hyper-parameters, with their descriptions."""
+
+
+def misdeclared(cls: type[Method]) -> dict[str, str]:
+    """Return the declarations of a class that have another type, each with what it must be."""
+    return {
+        name: words
+        for name, (kind, words) in DECLARATIONS.items()
+        if not isinstance(getattr(cls, name), kind)
+    }
 
 
 def place_of(error: BaseException, place: str) -> str:

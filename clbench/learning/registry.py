@@ -17,7 +17,7 @@ from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError, UnknownNameError, WrongTypeError
 from clbench.base.source import class_hash, has_source, package_of, source_hash
 from clbench.base.text import did_you_mean
-from clbench.learning.hooks import misfits, uncalled_functions
+from clbench.learning.hooks import misdeclared, misfits, uncalled_functions
 from clbench.learning.method import Method
 from clbench.spec.identifiers import built_in_methods, installed_methods, unknown_method
 
@@ -33,8 +33,8 @@ def load_method(spec: str) -> type[Method]:
     Raises:
         UnknownNameError: No such method is installed or can be imported; the message names the nearest one.
         InputError: The module of the method raises an error while it is imported.
-        WrongTypeError: The object of this name is not a method, or has a hook that is misspelt or that the
-            loop cannot call.
+        WrongTypeError: The object of this name is not a method, has a hook that is misspelt or that the loop
+            cannot call, or has a declaration, such as `uses`, of another type.
     """
     if ":" in spec:
         cls = resolve(spec)
@@ -50,7 +50,9 @@ def load_method(spec: str) -> type[Method]:
         # a misspelt hook would run as plain fine-tuning, and nobody would know
         raise WrongTypeError(f"{spec!r}: nothing calls {name}().{hint} Names of helpers begin with _.")
     for hook, (given, taken) in misfits(cls).items():
-        raise WrongTypeError(f"{spec!r}: {hook}() must take ({given}), not ({taken}).")
+        raise WrongTypeError(f"{spec!r}: {hook}() must take {given}, not {taken}.")
+    for name, words in misdeclared(cls).items():
+        raise WrongTypeError(f"{spec!r}: {name} must be {words}, not {getattr(cls, name)!r}.")
     return cls
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from clbench.base.cache import cache_folder, cached, hash_of
+from clbench.base.cache import cache_folder, cached, hash_of, hash_of_tensors
 from clbench.base.progress import ProgressCallback
 from clbench.learning.method import Method, MethodState, Progress
 from clbench.learning.method_state import read_state, write_state
@@ -59,7 +59,7 @@ def watch(
         )
     inputs = {
         **pretraining_inputs(scenario, seed),
-        "instructions": torch.backends.cpu.get_cpu_capability(),
+        "pretrained": hash_of_tensors(pretrained.state_dict()),  # other processors end at other weights
         "method": describe_method(type(method))["source"],
         "class": f"{type(method).__module__}:{type(method).__qualname__}",
         "settings": {name: repr(value) for name, value in dataclasses.asdict(method).items()},

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from clbench.base.entry_points import resolve
+from clbench.base.entry_points import resolve, unknown
 from clbench.base.errors import InputError, WrongTypeError
-from clbench.policy.policy import Policy, PolicyConfig
+from clbench.policy.policy import ABILITIES, Policy, PolicyConfig
 from clbench.policy.transformer import TransformerPolicy
 from clbench.spec.policies import POLICIES, check_policy_name
 
@@ -41,9 +41,16 @@ def check_abilities(kind: str, needs: Iterable[str], method: str) -> None:
         method: Name of the method, for the message.
 
     Raises:
+        UnknownNameError: There is no such ability.
+        WrongTypeError: The abilities of the policy are no set.
         InputError: The policy lacks some of them.
     """
+    for need in needs:
+        if need not in ABILITIES:
+            raise unknown("ability of a policy", need, ABILITIES)
     offered = policy_class(kind).abilities
+    if not isinstance(offered, frozenset | set):
+        raise WrongTypeError(f"{kind}: abilities must be a set of texts, not {offered!r}.")
     missing = sorted(set(needs) - offered)
     if missing:
         raise InputError(

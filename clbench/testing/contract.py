@@ -22,9 +22,15 @@ from typing import Any, get_type_hints
 
 from clbench.base.errors import InputError
 from clbench.base.seeding import seeded
-from clbench.learning.hooks import misfits, own_classes, uncalled_functions
-from clbench.learning.method import Metadata, Method
-from clbench.learning.prior import Access, Uses
+from clbench.learning.hooks import (
+    DECLARATIONS,
+    misdeclared,
+    misfits,
+    own_classes,
+    uncalled_functions,
+)
+from clbench.learning.method import Method
+from clbench.learning.prior import Access
 from clbench.learning.registry import read_changes
 from clbench.policy.policy import ABILITIES
 from clbench.runs.spec import is_setting
@@ -50,15 +56,6 @@ method that moves least, `finch`, gains 2.1."""
 
 PRIOR = ("demonstrations", "questions")
 """Kinds of prior data, by the fields of `Uses`."""
-
-_KINDS: dict[str, tuple[Any, str]] = {
-    "uses": (Uses, "a Uses"),
-    "metadata": (Metadata, "a Metadata"),
-    "tunes": (tuple | None, "a tuple, the name of a hyper-parameter and two values of it, or None"),
-    "needs": (tuple, "a tuple of abilities of a policy"),
-    "whole_stages": (bool, "a bool"),
-}
-"""Types of the declarations of a class besides its hyper-parameters, with their descriptions."""
 
 
 def check_method(cls: type[Method], *, policy: str = DEFAULT_POLICY, **settings: Any) -> None:
@@ -169,10 +166,10 @@ def declaration(subject: Subject) -> None:
 def _check_declared(cls: type[Method]) -> None:
     """Check the declarations of the class besides its hyper-parameters."""
     fields = {field.name for field in dataclasses.fields(cls)}
-    for name, (kind, words) in _KINDS.items():
-        value = getattr(cls, name)
-        if not isinstance(value, kind):
-            raise _breach(declaration, f"{name} to be {words}", repr(value), name)
+    wrong = misdeclared(cls)
+    for name in DECLARATIONS:
+        if name in wrong:
+            raise _breach(declaration, f"{name} to be {wrong[name]}", repr(getattr(cls, name)), name)
         if name in fields:
             expected = f"`{name} = ...` without an annotation, which would make it a hyper-parameter"
             raise _breach(declaration, expected, f"{name} is a field of the dataclass", name)
@@ -223,7 +220,8 @@ def _check_names(cls: type[Method]) -> None:
 def _check_signatures(cls: type[Method]) -> None:
     """Check that the loop can call every hook."""
     for hook, (given, taken) in misfits(cls).items():
-        raise _breach(declaration, f"{hook}({given})", f"{hook}({taken})", f"{hook}()")
+        found = f"{hook}{taken}" if taken.startswith("(") else taken
+        raise _breach(declaration, f"{hook}{given}", found, f"{hook}()")
 
 
 def constructor(subject: Subject) -> None:

@@ -22,8 +22,10 @@ import sys
 from clbench.base.entry_points import resolve
 world = resolve(sys.argv[1])(render_mode="rgb_array")
 world.reset(seed=0)
-world.render().shape
+picture = world.render()
 world.close()
+if getattr(picture, "ndim", None) != 3:
+    sys.exit(f"{sys.argv[1]}: render() returns {type(picture).__name__}, not a picture (H, W, 3)")
 """
 
 _MAKE_CONTEXT = "import mujoco; mujoco.GLContext(8, 8).make_current()"
@@ -108,9 +110,9 @@ def working_back_end(worlds: Iterable[str], chosen: str | None) -> str:
     Raises:
         RenderingError: No back end draws them all; the message names the packages to install.
     """
-    faults = []
+    faults, needed = [], sorted(set(worlds))
     for back_end in (chosen,) if chosen else _BACK_ENDS:
-        found = [fault for world in sorted(set(worlds)) if (fault := rendering_fault(back_end, world))]
+        found = [fault for world in needed if (fault := rendering_fault(back_end, world))]
         if not found:
             return back_end
         faults.append(f"{back_end} ({found[0]})")

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from rich.console import Console
-from rich.text import Text
 
 from clbench.base.errors import InputError, MissingPackageError
+from clbench.base.text import print_plain
 from clbench.cli.arguments import ScenarioId, add_cwd_to_path, check_names, checked_input, whole_number
 from clbench.records.paths import RECORDS, check_folder
 from clbench.spec.identifiers import folder_name, scenario_ids, without_module
@@ -99,7 +99,7 @@ def method_pages(
     texts = pages(built_in_descriptions(), sources)
     with checked_input():
         write_all({output / name: text for name, text in texts.items()})
-    Console().print(Text(f"Written: {len(texts)} pages in {output}"), soft_wrap=True)
+    print_plain(Console(), f"Written: {len(texts)} pages in {output}")
 
 
 def scenario_card(
@@ -146,12 +146,12 @@ def scenario_card(
             except MissingPackageError as error:
                 if scenarios:
                     raise
-                console.print(Text(f"The card of {name} stays as it is. {error.args[0]}"))
+                print_plain(console, f"The card of {name} stays as it is. {error.args[0]}")
                 continue
             typed[scenario.id], homes[output / folder_name(scenario.id)] = name, scenario
     fault = choose_renderer([task for home, scenario in homes.items() for task in undrawn(scenario, home)])
     if fault is not None:
-        console.print(Text(f"No pictures are drawn; existing ones are kept. {fault}"))
+        print_plain(console, f"No pictures are drawn; existing ones are kept. {fault}")
     for home, scenario in homes.items():
         experts = make_missing(scenario, home, episodes, drawing=fault is None, console=console)
         drawn = {task.name for task in scenario.tasks if picture_path(home, task).is_file()}
@@ -180,7 +180,7 @@ def _evidence(
     for folder in (records, controls, ladder_of(records)):
         if not folder.is_dir():
             text = f"There is no folder {folder}: verdicts may differ from the published ones."
-            Console(stderr=True, soft_wrap=True).print(Text(text, style="yellow"))
+            print_plain(Console(stderr=True), text, "yellow")
     return read_evidence(records, controls)
 
 

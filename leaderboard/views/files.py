@@ -7,10 +7,10 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from rich.console import Console
-from rich.text import Text
 
 from clbench.base.errors import InputError
 from clbench.base.leftovers import replacing
+from clbench.base.text import print_plain
 
 
 def write_all(texts: Mapping[Path, str]) -> list[Path]:
@@ -40,4 +40,4 @@ def print_written(paths: Iterable[Path]) -> None:
     """Print the paths of files that were written."""
     console = Console()
     for path in paths:
-        console.print(Text(f"Written: {path}"), soft_wrap=True)
+        print_plain(console, f"Written: {path}")

@@ -34,3 +34,9 @@ def test_an_error_inside_a_third_party_module_is_one_line_that_names_it(
     message = "'faulty_module' cannot be imported for 'x': ValueError: nothing works"
     with pytest.raises(InputError, match=message):
         import_module("faulty_module", "x")
+
+
+def test_a_script_that_exits_is_no_end_of_the_command(write_module: Callable[[str, str], None]) -> None:
+    write_module("exiting_module", "import sys; sys.exit(3)")
+    with pytest.raises(InputError, match="'exiting_module' cannot be imported for 'x': SystemExit: 3"):
+        import_module("exiting_module", "x")

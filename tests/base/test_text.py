@@ -1,12 +1,16 @@
 """Texts for people: what strangers wrote is shown, and does nothing."""
 
+import io
+
 import pytest
+from rich.console import Console
 
 from clbench.base.text import (
     counted,
     did_you_mean,
     html_table,
     listed,
+    print_plain,
     printable,
     printable_lines,
     quoted,
@@ -64,3 +68,11 @@ def test_an_html_table_has_every_cell_and_no_markup_of_its_texts() -> None:
 def test_a_long_text_is_cut_with_where_the_whole_one_is() -> None:
     assert shortened("x" * 500, "seed-0.json") == "x" * 500
     assert shortened("x" * 501, "seed-0.json") == f"{'x' * 500} [... seed-0.json has the rest]"
+
+
+def test_plain_text_is_printed_as_it_is() -> None:
+    text = "my:cat:Policy [bold]is[/bold] " + "long " * 40 + "42"
+    console = Console(file=io.StringIO(), width=40, force_terminal=True)
+    print_plain(console, text)
+    assert isinstance(console.file, io.StringIO)
+    assert console.file.getvalue() == f"{text}\n"

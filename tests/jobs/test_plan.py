@@ -62,8 +62,8 @@ def test_a_missing_entry_point_of_any_task_is_refused_before_the_first_job(
 ) -> None:
     run = RunSpec(TINY.id, "sft", 0).resolve()
     *first, last = getattr(run.scenario, group)
-    wrong = dataclasses.replace(last, **{part: "tiny:Missing"})
-    scenario = dataclasses.replace(run.scenario, **{group: (*first, wrong)})
+    changes: dict[str, Any] = {group: (*first, dataclasses.replace(last, **{part: "tiny:Missing"}))}
+    scenario = dataclasses.replace(run.scenario, **changes)
     plan = Plan()
     with pytest.raises(
         UnknownNameError, match="No entry point 'tiny:Missing': module 'tiny' has no 'Missing'"

@@ -44,6 +44,27 @@ class Short(Method):
 
 
 @dataclasses.dataclass
+class Kept(Method):
+    """Has a hyper-parameter of a hook's name."""
+
+    state: float = 0.5  # type: ignore[assignment]
+
+
+@dataclasses.dataclass
+class Needy(Method):
+    """Needs an ability, and no tuple of abilities."""
+
+    needs = "answers"  # type: ignore[assignment]
+
+
+@dataclasses.dataclass
+class Undeclared(Method):
+    """Declares its data by a word."""
+
+    uses = "prepare"  # type: ignore[assignment]
+
+
+@dataclasses.dataclass
 class Helpful(Method):
     """Has a public helper, which a hook calls, and a private one, which nothing calls."""
 
@@ -77,9 +98,12 @@ def test_the_hooks_are_all_public_functions_of_the_class() -> None:
         (Deep, "nothing calls gradient(). Did you mean 'gradients()'? Names of helpers begin with _."),
         (Foreign, "nothing calls on_train_start()."),
         (Short, "loss() must take (self, policy, batch, progress), not (self, policy, batch)."),
+        (Kept, "state() must take (self), not the value 0.5."),
+        (Needy, "needs must be a tuple of abilities of a policy, not 'answers'."),
+        (Undeclared, "uses must be a Uses, not 'prepare'."),
     ],
 )
-def test_a_hook_that_the_loop_would_never_reach_is_refused_before_the_run(
+def test_a_hook_or_a_declaration_that_the_loop_cannot_use_is_refused_before_the_run(
     cls: type[Method], message: str, stranger: Stranger
 ) -> None:
     with pytest.raises(TypeError, match=re.escape(message)):

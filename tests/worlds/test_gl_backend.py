@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+from clbench.testing import ToyWorld
 from clbench.worlds.gl_backend import RenderingError, choose_back_end, draw_without_display, rendering_fault
 
 WORLD = "clbench.testing:ToyWorld"
@@ -37,6 +38,31 @@ def test_osmesa_comes_second(monkeypatch: pytest.MonkeyPatch) -> None:
     tried = _only(monkeypatch, "osmesa")
     assert choose_back_end([WORLD]) == "osmesa" == os.environ["MUJOCO_GL"]
     assert tried == ["egl", "osmesa"]
+
+
+def test_each_back_end_is_tried_on_all_worlds_even_if_they_come_from_a_generator(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tried = _only(monkeypatch)
+    with pytest.raises(RenderingError):
+        choose_back_end(world for world in (WORLD, "clbench.testing:Other"))
+    assert tried == ["egl", "egl", "osmesa", "osmesa"]
+
+
+class Blind(ToyWorld):
+    """It returns no picture."""
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        super().__init__()
+        self.render_mode = render_mode
+
+    def render(self) -> None:
+        return None
+
+
+def test_a_world_without_pictures_is_named() -> None:
+    world = f"{__name__}:Blind"
+    assert rendering_fault("egl", world) == f"{world}: render() returns NoneType, not a picture (H, W, 3)"
 
 
 def test_where_nothing_draws_the_debian_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
