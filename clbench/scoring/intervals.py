@@ -261,16 +261,15 @@ def mean_of_seeds(values: Sequence[float], span: Span, *, ratio: bool = False) -
 
     `ratio` is that of `interval`; the mean is then geometric.
     """
-    if ratio and min(values) > 0:
-        found = mean_of_seeds([math.log(value) for value in values], UNBOUNDED)
-        mean, low, high = (
-            None if one is None else math.exp(one) for one in (found.value, found.low, found.high)
-        )
-        return Estimate(mean, low, high, found.of_seeds)
-    mean = math.fsum(values) / len(values)
+    geometric = ratio and min(values) > 0
+
+    def mean(some: Sequence[float]) -> float:
+        if geometric:
+            return math.exp(math.fsum(map(math.log, some)) / len(some))
+        return math.fsum(some) / len(some)
+
     rest = [[*values[:place], *values[place + 1 :]] for place in range(len(values))]
-    without_one = [math.fsum(part) / len(part) for part in rest if part]
-    return interval(mean, np.array(without_one), span=span)
+    return interval(mean(values), np.array([mean(part) for part in rest if part]), span=span, ratio=geometric)
 
 
 def interval_of_seeds(value: float, error: float, degrees: int, span: Span) -> Span:
