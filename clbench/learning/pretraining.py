@@ -85,7 +85,7 @@ def _own_weights(scenario: Scenario, seed: int) -> dict[str, str]:
     return {"weights": _weights_hash(cls, policy_config(scenario), seed)} if cls.pretrained else {}
 
 
-@functools.lru_cache(maxsize=16)  # a run asks at every stage, and a large policy takes seconds to load
+@functools.cache  # each look at the records asks for every seed, and a large policy takes seconds to load
 def _weights_hash(cls: type[Policy], config: PolicyConfig, seed: int) -> str:
     return hash_of_tensors(cls(config, derive_seed("weights", seed)).state_dict())
 

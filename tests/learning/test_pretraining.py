@@ -25,7 +25,8 @@ from clbench.learning.pretraining import (
     shipped_folder,
 )
 from clbench.policy.kinds import new_policy
-from clbench.policy.policy import Policy
+from clbench.policy.policy import Policy, PolicyConfig
+from clbench.policy.transformer import TransformerPolicy
 
 FETCH = load_scenario("clbench/Fetch-v1")
 SHIPS = shipped_folder(FETCH, 0)
@@ -53,6 +54,25 @@ def test_the_committed_records_of_a_seed_started_from_the_policy_that_ships() ->
     records = Path(__file__).parents[2] / "leaderboard" / "records" / "Fetch-v1"
     record = json.loads((records / "sft" / "seed-0.json").read_text(encoding="utf-8"))
     assert files["policy.safetensors"].startswith(record["fingerprint"]["pretrained"])
+
+
+class Weighed(TransformerPolicy):
+    """Has pretrained weights of its own, and counts how often they are loaded."""
+
+    pretrained = True
+    loaded = 0
+
+    def __init__(self, config: PolicyConfig, seed: int = 0) -> None:
+        super().__init__(config, seed)
+        type(self).loaded += 1
+
+
+def test_weights_that_a_policy_brings_are_loaded_once_per_seed_however_many_seeds_and_looks() -> None:
+    brief = dataclasses.replace(load_scenario("clbench.testing:clbench/Toy-v0"), policy=f"{__name__}:Weighed")
+    before = Weighed.loaded
+    first, again = ([pretraining_inputs(brief, seed)["weights"] for seed in range(20)] for _ in range(2))
+    assert first == again
+    assert Weighed.loaded - before == 20
 
 
 def test_other_seeds_are_pretrained_in_the_cache() -> None:
