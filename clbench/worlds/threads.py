@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 import weakref
 from collections.abc import Callable, Sequence
+from pathlib import Path, PurePosixPath
 from queue import SimpleQueue
 from typing import Generic, TypeVar
 
@@ -16,9 +18,50 @@ _PATIENCE = 5.0
 team at any moment, even while its thread holds a lock that an ending thread needs."""
 
 
+PROCESS_CGROUPS = Path("/proc/self/cgroup")
+"""File in which Linux lists the control groups of this process, a line for each hierarchy."""
+CGROUPS = Path("/sys/fs/cgroup")
+"""Folder of the control groups: those of version 2, and a folder for each controller of version 1."""
+
+
 def cores() -> int:
-    """Return the number of cores that this process may use, which may be only some of the machine's."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Return the number of cores that this process may use, which may be only some of the machine's.
+
+    The cores that it may run on count, and the CPU quota of its control groups, rounded up: a container with
+    4.5 of 128 cores has 5.
+    """
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    quota = _quota()
+    return usable if quota == math.inf else max(1, min(usable, math.ceil(quota)))
+
+
+def _quota() -> float:
+    """Return the smallest CPU quota of this process's control groups and their parents, in cores."""
+    try:
+        lines = PROCESS_CGROUPS.read_text(encoding="utf-8").splitlines()
+    except OSError:  # this is no Linux
+        return math.inf
+    quotas = [math.inf]
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        # a container may see the path of the machine, but its own group at the root
+        own = PurePosixPath(path.lstrip("/"))
+        for group in (own, *own.parents):
+            if not controllers:
+                quotas.append(_quota_of(CGROUPS / group / "cpu.max"))
+            elif "cpu" in controllers.split(","):
+                folder = CGROUPS / "cpu" / group
+                quotas.append(_quota_of(folder / "cpu.cfs_quota_us", folder / "cpu.cfs_period_us"))
+    return min(quotas)
+
+
+def _quota_of(*files: Path) -> float:
+    """Return the cores of a group from files that hold its microseconds of CPU time and of a period."""
+    try:
+        quota, period = map(int, " ".join(file.read_text(encoding="ascii") for file in files).split())
+    except (OSError, ValueError):  # no such controller, or the text "max" for no quota
+        return math.inf
+    return quota / period if quota > 0 else math.inf  # version 1 says -1 for no quota
 
 
 class Team:

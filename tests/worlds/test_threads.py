@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -131,12 +132,55 @@ def test_an_interpreter_exits_at_once_with_a_team_that_nobody_closed() -> None:
 @pytest.mark.skipif(
     not hasattr(os, "sched_setaffinity"), reason="a process cannot be held to some cores here"
 )
-def test_only_the_cores_that_this_process_may_use_count() -> None:
+def test_only_the_cores_that_this_process_may_use_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     code = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
     code += "from clbench.worlds.threads import cores; print(cores())"
     one = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert int(one.stdout) == 1
+    monkeypatch.setattr("clbench.worlds.threads.PROCESS_CGROUPS", tmp_path / "no cgroup")
     assert cores() == len(os.sched_getaffinity(0))
+
+
+@pytest.mark.parametrize(
+    ("groups", "files", "expected"),
+    [
+        ("0::/", {"cpu.max": "400000 100000"}, 4),
+        ("0::/", {"cpu.max": "450000 100000"}, 5),
+        ("0::/", {"cpu.max": "50000 100000"}, 1),
+        ("0::/", {"cpu.max": "max 100000"}, 128),
+        ("0::/", {"cpu.max": "25600000 100000"}, 128),
+        ("0::/", {}, 128),
+        ("0::/pod/run", {"pod/run/cpu.max": "max 100000", "pod/cpu.max": "300000 100000"}, 3),
+        ("0::/pod/run", {"pod/run/cpu.max": "200000 100000", "pod/cpu.max": "300000 100000"}, 2),
+        ("0::/docker/of-the-machine", {"cpu.max": "400000 100000"}, 4),
+        ("3:cpu,cpuacct:/pod\n1:memory:/", {"cpu/pod/cpu.cfs": "250000 100000"}, 3),
+        ("3:cpu,cpuacct:/pod\n0::/", {"cpu/pod/cpu.cfs": "-1 100000", "cpu/cpu.cfs": "700000 100000"}, 7),
+        ("3:cpuset:/pod", {"cpu/pod/cpu.cfs": "250000 100000"}, 128),
+    ],
+)
+def test_a_cpu_quota_of_a_control_group_or_its_parents_limits_the_cores(
+    groups: str,
+    files: dict[str, str],
+    expected: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(128), raising=False)
+    monkeypatch.setattr("clbench.worlds.threads.PROCESS_CGROUPS", tmp_path / "cgroup")
+    monkeypatch.setattr("clbench.worlds.threads.CGROUPS", tmp_path)
+    (tmp_path / "cgroup").write_text(groups + "\n", encoding="utf-8")
+    for name, text in files.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if name.endswith(".cfs"):  # version 1 has two files
+            quota, period = text.split()
+            (path.parent / "cpu.cfs_quota_us").write_text(quota + "\n", encoding="utf-8")
+            (path.parent / "cpu.cfs_period_us").write_text(period + "\n", encoding="utf-8")
+        else:
+            path.write_text(text + "\n", encoding="utf-8")
+    assert cores() == expected
 
 
 @pytest.mark.parametrize("at", ["the caller works", "the caller waits"])
