@@ -42,6 +42,8 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     `scenario.group(info["task"])` tells which part of the scenario a task belongs to. The wordings are those
     of training: `clbench.evaluate_agent` and `clbench score` also play episodes with test wordings. A copy
     made by pickle is a new environment, which begins with its own first `reset()`.
+    Metadata: `render_fps` is the rate of the present task, in steps per second. Gymnasium's `RecordVideo`
+    reads it once: where a world has several rates, wrap the environment after `reset()`.
 
     Args:
         scenario: Scenario, or its entry point "module:attribute".
@@ -84,7 +86,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._steps, self._ended = 0, False
         first = self.scenario.tasks[0]
         world = self._world(first)
-        self.metadata = {**self.metadata, "render_fps": world.metadata.get("render_fps", 25)}
+        self.metadata = {**self.metadata, **_rate(world)}
         assert isinstance(world.observation_space, spaces.Box)
         assert isinstance(world.action_space, spaces.Box)
         self.action_space = self._actions = world.action_space
@@ -122,7 +124,9 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             self._schedule.begin()
         self._begun = start = self._schedule.next(self.np_random, options or {})
         self._steps, self._ended = 0, False
-        state, _ = self._world(start.task).reset(seed=start.seed, options={"task": start.task.name})
+        world = self._world(start.task)
+        state, _ = world.reset(seed=start.seed, options={"task": start.task.name})
+        self.metadata.update(_rate(world))  # in place: wrappers share the dictionary
         return self._observation(state), start.info(False)
 
     @property
@@ -169,3 +173,8 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             observer.close()
         self._worlds.clear()
         self._observers.clear()
+
+
+def _rate(world: World) -> dict[str, Any]:
+    """Return the steps per second of a world's present task, as an entry of the metadata."""
+    return {"render_fps": world.metadata.get("render_fps", ScenarioEnv.metadata["render_fps"])}

@@ -31,6 +31,25 @@ def test_a_recorded_episode_has_the_speed_of_its_world() -> None:
     assert _toy().metadata["render_fps"] == 10  # Gymnasium's RecordVideo reads it; the class says 25
 
 
+class Paced(ToyWorld):
+    """A world with a rate for each task."""
+
+    def reset(self, **options: Any) -> Any:
+        begun = super().reset(**options)
+        self.metadata = {**self.metadata, "render_fps": {"left": 5, "up": 50}[self._task]}
+        return begun
+
+
+def test_the_speed_follows_the_task_at_each_reset_and_is_the_environments_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("clbench.testing.ToyWorld", Paced)
+    env, other = gymnasium.make("clbench.testing:clbench/Toy-v0"), _toy()
+    shown = [env.reset(options={"task": task}) and env.metadata["render_fps"] for task in ("left", "up")]
+    assert shown == [5, 50]
+    assert (other.metadata["render_fps"], ScenarioEnv.metadata["render_fps"]) == (10, 25)
+
+
 def test_the_schedule_goes_from_the_skills_to_each_target_and_stays_at_the_last() -> None:
     env = _toy(episodes_per_stage=3)
     schedule = []
