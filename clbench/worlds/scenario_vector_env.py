@@ -44,7 +44,8 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         stage: Stage to stay in, for an agent that is trained stage by stage; None goes through all stages.
         order: Order of the targets, see `Scenario.in_order`; 0 is the published order.
         task: Name of the only task; None has those of the stages.
-        threads: Threads that step the worlds, by default one per core. Results do not depend on it.
+        threads: Threads that step the worlds, by default one per core, at most one per environment.
+            Results do not depend on it.
         render_mode: None; environments side by side cannot be drawn.
 
     Raises:
@@ -85,7 +86,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
             Schedule(self.scenario, episodes_per_stage, instruction, stage, task) for _ in range(num_envs)
         ]
         self._generators: list[np.random.Generator] = [np_random()[0] for _ in range(num_envs)]
-        self._lanes = Lanes(num_envs, threads or cores())
+        self._lanes = Lanes(num_envs, min(num_envs, threads or cores()))  # more would never get work
         first = self.scenario.tasks[0]
         world = self._lanes.world(first)
         shown = self._lanes.observer(first).spaces(world.single_observation_space)

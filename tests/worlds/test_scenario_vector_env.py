@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from gymnasium.vector import VectorEnv
 
+from clbench.testing import ToyWorld
+from clbench.worlds.lanes import PlainVectorWorld
 from clbench.worlds.scenario_vector_env import ScenarioVectorEnv
 
 FETCH = "clbench/Fetch-v1"
@@ -65,6 +67,23 @@ def test_it_does_so_with_the_suites_own_vector_world() -> None:
 
 def _toy(**options: Any) -> ScenarioVectorEnv:
     return ScenarioVectorEnv("clbench.testing:TOY", num_envs=2, **options)
+
+
+@pytest.mark.parametrize(("cores", "threads", "expected"), [(128, None, 2), (1, None, 1), (128, 3, 2)])
+def test_no_more_threads_step_than_there_are_environments(
+    cores: int, threads: int | None, expected: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made_with: list[int] = []
+
+    class Recorded(PlainVectorWorld):
+        def __init__(self, lanes: int, threads: int) -> None:
+            super().__init__(ToyWorld, lanes)
+            made_with.append(threads)
+
+    monkeypatch.setattr(ToyWorld, "vector_world", Recorded, raising=False)
+    monkeypatch.setattr("clbench.worlds.scenario_vector_env.cores", lambda: cores)
+    _toy(threads=threads).reset(seed=0)
+    assert made_with == [expected]
 
 
 def test_options_choose_for_all_and_seeds_for_each() -> None:
