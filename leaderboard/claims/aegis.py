@@ -27,6 +27,9 @@ from .claim import (
 )
 from .evidence import SHARE, Evidence, Figure
 from .figures import (
+    ENDS,
+    RANDOM,
+    anchor_distance,
     anchor_ratio,
     answer_curve,
     drift_ratio,
@@ -218,8 +221,7 @@ def keeps_answers(evidence: Evidence) -> Finding:
         evidence.difference("question_retention", method, "frozen", form=".3f") for method in ("aegis", "sft")
     )
     gains: tuple[Figure, ...] = tuple(
-        evidence.difference("question_retention", "aegis", other, form=".3f")
-        for other in ("sft", "aegis+direction=random")
+        evidence.difference("question_retention", "aegis", other, form=".3f") for other in ("sft", RANDOM)
     )
     of_sft = question_drop(evidence, "sft")
     if loses_no_answers(of_sft):
@@ -298,25 +300,39 @@ def _of_stages(evidence: Evidence, name: str, what: str, stage: int | None = Non
     "A6",
     AEGIS,
     reported="stated about the projection; no number was found",
-    rule="Distance of the robot's batch to the anchor at the end of the first stage, which AEGIS defines as "
-    "the drift, divided by that with a random direction, which removes nearly no energy: holds if the upper "
-    "end is below 0.5; does not hold if the lower end is above 0.5.",
-    settled="2026-11-28T17:16Z",
+    rule="Two figures. The first is AEGIS's own drift: the distance of the robot's batch to the anchor at "
+    "the end of the first stage, divided by that with a random direction, which removes nearly no energy. "
+    "The second is how far training moves the hidden states of the questions, of which the anchor is made, "
+    "divided by sft's. Holds if both upper ends are below 0.5; holds in part if only the first is; does not "
+    "hold if the lower end of the first is above 0.5.",
+    settled="2026-11-29T01:25Z",
     margin="half of the drift",
     scenarios=KNOWLEDGE,
 )
 def removes_drift(evidence: Evidence) -> Finding:
     """Removes the cumulative drift of activations."""
     near = anchor_ratio(evidence)
-    on_questions, at_random = (
-        drift_ratio(evidence, method) for method in ("aegis", "aegis+direction=random")
-    )
+    on_questions, at_random = (drift_ratio(evidence, method) for method in ("aegis", RANDOM))
+    first, last = (anchor_distance(evidence, "aegis", end) for end in ENDS)
+    near_enough = near.high < 0.5
     return Finding(
-        decided(holds=near.high < 0.5, fails=near.low > 0.5),
-        (near,),
-        (on_questions, at_random),
-        _on_questions(on_questions),
-        what_would_change(near, 0.5),
+        decided(holds=near_enough and on_questions.high < 0.5, in_part=near_enough, fails=near.low > 0.5),
+        (near, on_questions),
+        (first, last, *(anchor_distance(evidence, RANDOM, end) for end in ENDS), at_random),
+        (*_where_it_begins(first, last), *_on_questions(on_questions)),
+        what_would_change(on_questions if near_enough else near, 0.5),
+    )
+
+
+def _where_it_begins(first: Figure, last: Figure) -> tuple[str, ...]:
+    """Return a sentence if AEGIS certainly ends nearer to its anchor than it begins."""
+    if not last.high < first.low:
+        return ()
+    return (
+        "The robot's batches are no questions, so that their squared distance to the anchor is "
+        f"{first.value:.0f} before the first step. It ends at {last.value:.1f}. The projection removes only "
+        "what leads away: it does not hold the robot's hidden states in place, and they move onto those of "
+        "the questions.",
     )
 
 
@@ -325,9 +341,8 @@ def _on_questions(drift: Figure) -> tuple[str, ...]:
     if not drift.high >= 0.5:  # also without an interval
         return ()
     return (
-        "The anchor is one of the robot's batches. The hidden states of questions, whose answers can be lost "
-        f"nevertheless (A4), drift {drift.value:.2f} [{drift.low:.2f}, {drift.high:.2f}] times as far as "
-        "those of sft.",
+        "The hidden states of questions, whose answers can be lost nevertheless (A4), drift "
+        f"{drift.value:.2f} [{drift.low:.2f}, {drift.high:.2f}] times as far as those of sft.",
     )
 
 

@@ -117,28 +117,29 @@ def auxiliary_objective_helps(evidence: Evidence) -> Finding:
     reported="LIBERO 90.1 with the vector, 87.5 with the auxiliary objective, 82.1 with neither, after 5,000 "
     "steps (Table 1)",
     rule="Steps to the criterion at the scenario's learning rate. Holds if the upper ends of fast_dvla "
-    "divided by sft and by a random vector of equal norms are below 0.95; does not hold if the lower end "
-    "of one of the two is above 0.95. Cannot be shown here for the reasons of F1, or if "
+    "divided by sft and by a random vector of equal norms are below 0.95, and that divided by co_training, "
+    "whose objective it replaces, is below 1.05; does not hold if the lower end of one of the first two is "
+    "above 0.95, or that of the third above 1.05. Cannot be shown here for the reasons of F1, or if "
     "co_training certainly saves less than 5 % of the steps.",
-    settled="2026-11-28T20:50Z",
+    settled="2026-11-29T01:25Z",
     margin="5 % of the steps",
 )
 def vector_carries_the_capability(evidence: Evidence) -> Finding:
     """The difference of two trainings on a few tasks is a vector; merged, it replaces the objective."""
     over_sft, over_random = _of_the_vector(evidence)
-    controls = (over_random, share_of_steps(evidence, CO_TRAINING, SFT))
-    random_decides = over_sft.high < 0.95 or over_random.low > 0.95
+    over_objective = share_of_steps(evidence, VECTOR, CO_TRAINING)
+    controls = (over_random, over_objective, share_of_steps(evidence, CO_TRAINING, SFT))
     if not_shown := _not_shown(evidence, over_sft, *controls):
         return not_shown
+    bars = ((over_sft, 0.95), (over_random, 0.95), (over_objective, 1.05))
+    failing = [(figure, bar) for figure, bar in bars if figure.low > bar]
+    not_below = [(figure, bar) for figure, bar in bars if not figure.high < bar]
     return Finding(
-        decided(
-            holds=over_sft.high < 0.95 and over_random.high < 0.95,
-            fails=over_sft.low > 0.95 or over_random.low > 0.95,
-        ),
+        decided(holds=not not_below, fails=bool(failing)),
         (over_sft,),
         controls,
         (),
-        what_would_change(over_random if random_decides else over_sft, 0.95),
+        what_would_change(*(failing or not_below or bars)[0]),
     )
 
 
@@ -257,15 +258,21 @@ def decodes_faster(evidence: Evidence) -> Finding:
     controls = (at_once, forward, *_counts(found))
     if single.forwards <= 1 and at_once.low >= -MOST_LOSS:
         why = "One forward succeeds at least as often as 12: a pipeline has nothing to speed up."
-        return Finding("cannot be shown here", figures, controls, (why,), HARDER)
+        return Finding("cannot be shown here", figures, controls, (why, PEER), HARDER)
     if forward.high < LEAST_RATIO:
         why = "A forward takes as long for all tokens as for a block: only fewer forwards save time here."
-        return Finding("cannot be shown here", figures, controls, (why,), WIDER)
-    return Finding(decided(holds=holds, fails=fails), figures, controls, (), change)
+        return Finding("cannot be shown here", figures, controls, (why, PEER), WIDER)
+    return Finding(decided(holds=holds, fails=fails), figures, controls, (PEER,), change)
 
 
 LEAST_SPEED_UP, MOST_LOSS, LEAST_RATIO = 2.65, 0.03, 1.5
 """The bars of F6: speed-up, loss of success, and how much longer a forward of all tokens must take."""
+
+PEER = (
+    "The decoder that it is compared with reads the observation once for a chunk, as the pipeline does. The "
+    "paper's base models read it in every forward: the part of its speed-up that comes from keeping the "
+    "observation is not in this figure."
+)
 
 HARDER = "Tasks in which actions that are decoded in one forward fail."
 WIDER = "A policy that is wide enough for the time of a forward to follow its tokens."

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -203,22 +204,41 @@ def drift_ratio(evidence: Evidence, method: str) -> Figure:
     return evidence.figure(f"activation drift, {method} / sft", ratio, method, "sft", ratio=True)
 
 
+RANDOM = "aegis+direction=random"
+"""AEGIS's control."""
+
+
 def anchor_ratio(evidence: Evidence) -> Figure:
     """Return the distance at which AEGIS keeps a batch from its anchor, divided by that of the control.
 
     The distance is the quantity that AEGIS acts on, on the robot's batches at the end of the first stage.
     The control has a random direction, and sheds nearly no energy; plain fine-tuning has no anchor.
     """
-    what = "distance of a batch to the anchor, aegis / aegis+direction=random"
-    return evidence.diagnostic_ratio("aegis", "aegis+direction=random", what, _last_distance)
+    what = f"distance of a batch to the anchor, aegis / {RANDOM}"
+    return evidence.diagnostic_ratio("aegis", RANDOM, what, partial(_distance, place=-1))
 
 
-def _last_distance(diagnostics: Mapping[str, Any]) -> float:
-    """Return the last distance of a batch to the anchor in the first stage, NaN if there is none."""
+ENDS = {"before the first step": 0, "at the end of the first stage": -1}
+"""Places among the distances of the first stage, by their words."""
+
+
+def anchor_distance(evidence: Evidence, method: str, end: str) -> Figure:
+    """Return the squared distance of a batch to AEGIS's anchor at one of `ENDS`, mean over seeds."""
+    what = f"distance of a batch to the anchor {end}, {method}"
+
+    def read(stages: Sequence[Mapping[str, Any]]) -> float | None:
+        found = _distance({"1": stages[0]}, ENDS[end]) if stages else math.nan
+        return None if math.isnan(found) else found
+
+    return evidence.pooled(method, what, read, (0, math.inf))
+
+
+def _distance(diagnostics: Mapping[str, Any], place: int) -> float:
+    """Return one of the distances of a batch to the anchor in the first stage, NaN if there is none."""
     found = diagnostics.get("1")
     values = found.get("anchor_distance") if isinstance(found, dict) else None
-    last: Any = values[-1] if isinstance(values, list) and values else None
-    return float(last) if is_number(last) and last > 0 else math.nan
+    value: Any = values[place] if isinstance(values, list) and values else None
+    return float(value) if is_number(value) and value > 0 else math.nan
 
 
 def median_stage(evidence: Evidence, method: str) -> Figure:

@@ -14,7 +14,7 @@ OVERFITS: Given = {"success on new targets, plain - perturbed, sft": (0.051, 0.1
     ("identifier", "what", "below", "above", "given"),
     [
         ("C3", "retained success, {} - experience_replay", (-0.3, -0.051), (0.0, 0.1), REPLAYED),
-        ("C4", SPARSE, (0.0, 0.049), (0.051, 0.2), {SPARSE.format("l2_sp"): (0.0, 0.051)}),
+        ("C4", SPARSE, (0.0, 0.049), (0.051, 0.2), {"update sparsity, sft@0.03 - sft@1": (0.0, 0.051)}),
         ("C7", "backward transfer of {}", (-0.3, -0.101), (0.0, 0.1), {}),
         ("C8", "loss in perturbed episodes, sft - {}", (0.0, 0.049), (0.051, 0.1), OVERFITS),
     ],

@@ -99,7 +99,7 @@ CASES: list[tuple[str, str, Given]] = [
                 **BOTH,
                 "update sparsity, consft - sft": first,
                 "update sparsity, consft_calibrated - sft": second,
-                **({"update sparsity, l2_sp - sft": response} if response else {}),
+                **({"update sparsity, sft@0.03 - sft@1": response} if response else {}),
             },
         )
         for first, second, response, verdict in (
@@ -188,11 +188,19 @@ CASES: list[tuple[str, str, Given]] = [
     ("F4", "undecided", {"time of fast_dvla": (1.0, 1.051)}),
     ("F4", "does not hold", {"time of fast_dvla": (1.051, 1.1)}),
     *[
-        ("A6", verdict, {"distance of a batch to the anchor, aegis / aegis+direction=random": ratio})
-        for ratio, verdict in (
-            ((0.1, 0.499), "holds"),
-            ((0.1, 0.501), "undecided"),
-            ((0.501, 0.9), "does not hold"),
+        (
+            "A6",
+            verdict,
+            {
+                "distance of a batch to the anchor, aegis / aegis+direction=random": ratio,
+                "activation drift, aegis / sft": drift,
+            },
+        )
+        for ratio, drift, verdict in (
+            ((0.1, 0.499), (0.1, 0.499), "holds"),
+            ((0.1, 0.499), (0.1, 0.501), "holds in part"),
+            ((0.1, 0.501), (0.1, 0.499), "undecided"),
+            ((0.501, 0.9), (0.1, 0.499), "does not hold"),
         )
     ],
 ]
@@ -328,7 +336,9 @@ def test_only_a_method_that_certainly_keeps_more_answers_than_plain_fine_tuning_
 CO_TRAINING, SFT_STEPS = "co_training+step_factor=1.0", "steps to the criterion, {} / sft@1"
 RANDOM = "steps to the criterion, fast_dvla@1 / fast_dvla+direction=random+step_factor=1.0"
 WITHOUT = "steps to the criterion, fast_dvla@1 / fast_dvla+orthogonal=0.0+step_factor=1.0"
+OBJECTIVE = f"steps to the criterion, fast_dvla@1 / {CO_TRAINING}"
 HELPS: Given = {SFT_STEPS.format(CO_TRAINING): (0.5, 0.95)}
+REPLACED: Given = {**HELPS, OBJECTIVE: (0.9, 1.049)}
 NO_HELP: Given = {SFT_STEPS.format(CO_TRAINING): (0.951, 1.0)}
 VECTOR = SFT_STEPS.format("fast_dvla@1")
 FAST, SLOW, OPEN = (0.5, 0.949), (0.951, 1.2), (0.949, 0.951)
@@ -348,14 +358,16 @@ FAST, SLOW, OPEN = (0.5, 0.949), (0.951, 1.2), (0.949, 0.951)
         ("F1", "undecided", {SFT_STEPS.format(CO_TRAINING): OPEN}, 20),
         ("F1", "cannot be shown here", {SFT_STEPS.format(CO_TRAINING): OPEN}, 19.5),
         ("F1", "does not hold", {SFT_STEPS.format(CO_TRAINING): SLOW}, 19.5),
-        ("F2", "holds", {**HELPS, VECTOR: FAST, RANDOM: FAST}, 20),
-        ("F2", "undecided", {**HELPS, VECTOR: FAST, RANDOM: OPEN}, 20),
-        ("F2", "undecided", {**HELPS, VECTOR: OPEN, RANDOM: FAST}, 20),
-        ("F2", "does not hold", {**HELPS, VECTOR: SLOW, RANDOM: FAST}, 20),
-        ("F2", "does not hold", {**HELPS, VECTOR: FAST, RANDOM: SLOW}, 20),
-        ("F2", "cannot be shown here", {**NO_HELP, VECTOR: FAST, RANDOM: FAST}, 20),
-        ("F2", "cannot be shown here", {**HELPS, VECTOR: OPEN, RANDOM: FAST}, 19.5),
-        ("F2", "holds", {**HELPS, VECTOR: FAST, RANDOM: FAST}, 19.5),
+        ("F2", "holds", {**REPLACED, VECTOR: FAST, RANDOM: FAST}, 20),
+        ("F2", "undecided", {**REPLACED, VECTOR: FAST, RANDOM: OPEN}, 20),
+        ("F2", "undecided", {**REPLACED, VECTOR: OPEN, RANDOM: FAST}, 20),
+        ("F2", "does not hold", {**REPLACED, VECTOR: SLOW, RANDOM: FAST}, 20),
+        ("F2", "does not hold", {**REPLACED, VECTOR: FAST, RANDOM: SLOW}, 20),
+        ("F2", "undecided", {**REPLACED, VECTOR: FAST, RANDOM: FAST, OBJECTIVE: (0.9, 1.051)}, 20),
+        ("F2", "does not hold", {**REPLACED, VECTOR: FAST, RANDOM: FAST, OBJECTIVE: (1.051, 1.2)}, 20),
+        ("F2", "cannot be shown here", {**REPLACED, **NO_HELP, VECTOR: FAST, RANDOM: FAST}, 20),
+        ("F2", "cannot be shown here", {**REPLACED, VECTOR: OPEN, RANDOM: FAST}, 19.5),
+        ("F2", "holds", {**REPLACED, VECTOR: FAST, RANDOM: FAST}, 19.5),
         ("F3", "holds", {**HELPS, WITHOUT: FAST}, 20),
         ("F3", "undecided", {**HELPS, WITHOUT: OPEN}, 20),
         ("F3", "does not hold", {**HELPS, WITHOUT: SLOW}, 20),
@@ -377,8 +389,8 @@ def test_a_saving_of_steps_counts_from_a_twentieth_on(
 def test_a_random_vector_that_is_as_good_decides_on_the_vector(monkeypatch: pytest.MonkeyPatch) -> None:
     stage = Figure("median", ("sft@1",), Estimate(20, None, None))
     monkeypatch.setattr(f"{MODULE}.fast_dvla.median_stage", lambda *_: stage)
-    assert f'"{RANDOM}"' in judged("F2", {**HELPS, VECTOR: FAST, RANDOM: SLOW}).change
-    assert f'"{VECTOR}"' in judged("F2", {**HELPS, VECTOR: SLOW, RANDOM: FAST}).change
+    assert f'"{RANDOM}"' in judged("F2", {**REPLACED, VECTOR: FAST, RANDOM: SLOW}).change
+    assert f'"{VECTOR}"' in judged("F2", {**REPLACED, VECTOR: SLOW, RANDOM: FAST}).change
 
 
 @pytest.mark.parametrize(("time", "says"), [((1.06, 1.2), True), ((1.04, 1.2), False)])
