@@ -9,6 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.error import CustomSpaceError
+from gymnasium.vector.utils import create_shared_memory
 
 from clbench.base.errors import InputError
 from clbench.spec.fields import is_whole
@@ -17,6 +19,23 @@ from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 
 InstructionFormat = Literal["text", "tokens"]
+
+
+class InstructionSpace(spaces.Text):
+    """Space of instructions as text, which equals Gymnasium's own, but is refused in shared memory.
+
+    `AsyncVectorEnv` reads texts from shared memory only once, before the first episode, and would show blank
+    instructions from then on.
+    """
+
+
+@create_shared_memory.register
+def _refuse_shared_memory(space: InstructionSpace, n: int = 1, ctx: Any = None) -> None:
+    raise CustomSpaceError(
+        "Gymnasium cannot show instructions as text from shared memory. Give AsyncVectorEnv "
+        'shared_memory=False (make_vec: vector_kwargs={"shared_memory": False}), or give the environment '
+        'instruction="tokens".'
+    )
 
 
 @dataclass(frozen=True)
@@ -86,7 +105,7 @@ class Schedule:
         tasks = (*self._scenario.tasks, *self._scenario.background)
         texts = [words for task in tasks for words in task.instructions + task.test_instructions]
         characters = {*string.ascii_lowercase, " ", *"".join(texts)}
-        return spaces.Text(max_length=max(map(len, texts)), charset="".join(sorted(characters)))
+        return InstructionSpace(max_length=max(map(len, texts)), charset="".join(sorted(characters)))
 
     def begin(self) -> None:
         """Go back to the first episode."""

@@ -369,7 +369,7 @@ def make():
     return gymnasium.make(name, render_mode="rgb_array")
 
 if side_by_side == "yes":  # before this process draws: a fork of one that draws may hang
-    envs = gymnasium.vector.AsyncVectorEnv([make] * 2)
+    envs = gymnasium.vector.AsyncVectorEnv([make] * 2, shared_memory=False)
     envs.reset(seed=0)
     envs.step(envs.action_space.sample())
     assert [picture.shape for picture in envs.render()] == [(480, 480, 3)] * 2
