@@ -90,6 +90,11 @@ def is_perturbable(task: Task) -> bool:
     return bool(getattr(getattr(world, "vector_world", None) or world, "perturbable", False))
 
 
+def success_at_horizon(task: Task) -> bool:
+    """Return whether the world of a task declares that it judges success only at the horizon."""
+    return bool(getattr(resolve(task.world), "success_at_horizon", False))
+
+
 def control_rate(task: Task) -> float | None:
     """Return the steps per second of a task in its world, None if the world does not give them."""
     with closing(resolve(task.world)()) as world:

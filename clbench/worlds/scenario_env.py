@@ -16,6 +16,7 @@ from clbench.spec.registry import opened_scenario
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 from clbench.worlds.gl_backend import draw_without_display
+from clbench.worlds.lanes import success_at_horizon
 from clbench.worlds.observation import Observer
 from clbench.worlds.schedule import InstructionFormat, Schedule, Start
 from clbench.worlds.world import World, checked_actions
@@ -37,7 +38,8 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     camera, `state` holds only the numbers that a policy may see, and `image`, uint8 (N, N, 3), the picture.
     Action: float32 (A,), from -1 to 1, clipped; a number that is not finite is refused.
     Reward: that of the task's world: dense, but sparse on LIBERO. An episode is terminated by success and
-    truncated at the task's horizon.
+    truncated at the task's horizon. Where success is judged only there, as on dm_control, an episode is
+    always truncated, and `info` alone tells success.
     Info: `task`, `stage`, `instruction`, `success`. The stage is 0 for all tasks that no stage trains;
     `scenario.group(info["task"])` tells which part of the scenario a task belongs to. The wordings are those
     of training: `clbench.evaluate_agent` and `clbench score` also play episodes with test wordings. A copy
@@ -83,7 +85,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._worlds: dict[str, World] = {}
         self._observers: dict[str, Observer] = {}
         self._begun: Start | None = None
-        self._steps, self._ended = 0, False
+        self._steps, self._ended, self._at_horizon = 0, False, False
         first = self.scenario.tasks[0]
         world = self._world(first)
         self.metadata = {**self.metadata, **_rate(world)}
@@ -123,7 +125,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         if seed is not None:
             self._schedule.begin()
         self._begun = start = self._schedule.next(self.np_random, options or {})
-        self._steps, self._ended = 0, False
+        self._steps, self._ended, self._at_horizon = 0, False, success_at_horizon(start.task)
         world = self._world(start.task)
         state, _ = world.reset(seed=start.seed, options={"task": start.task.name})
         self.metadata.update(_rate(world))  # in place: wrappers share the dictionary
@@ -147,12 +149,13 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         if self._ended:  # a success would be counted again
             raise gymnasium.error.ResetNeeded(f"The episode of {self.scenario.id} has ended: call reset().")
         (checked,) = checked_actions(np.asarray(action)[None], self._actions, self.scenario.id, 1)
-        state, reward, terminated, _, _ = self._world(task).step(checked)
+        state, reward, success, _, _ = self._world(task).step(checked)
         self._steps += 1
         self.steps_taken += 1
-        truncated = not terminated and self._steps >= task.horizon
-        self._ended = terminated or truncated
-        return self._observation(state), float(reward), terminated, truncated, self._start.info(terminated)
+        self._ended = success or self._steps >= task.horizon
+        terminated = success and not self._at_horizon
+        truncated = self._ended and not terminated
+        return self._observation(state), float(reward), terminated, truncated, self._start.info(success)
 
     def _observation(self, state: NDArray[np.float32]) -> Observation:
         shown, images = self._observers[self._start.task.world].observe(state[None])

@@ -20,7 +20,7 @@ from clbench.spec.fields import is_whole
 from clbench.spec.registry import opened_scenario
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
-from clbench.worlds.lanes import Lanes
+from clbench.worlds.lanes import Lanes, success_at_horizon
 from clbench.worlds.scenario_env import Observation
 from clbench.worlds.schedule import InstructionFormat, Schedule, Start
 from clbench.worlds.threads import cores
@@ -105,6 +105,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         self._states = np.zeros((num_envs, *world.single_observation_space.shape), np.float32)
         self._steps_left = np.zeros(num_envs, np.int64)
         self._ended = np.zeros(num_envs, np.bool_)
+        self._at_horizon = np.zeros(num_envs, np.bool_)
 
     def __getstate__(self) -> dict[str, Any]:  # as ScenarioEnv does
         return {"arguments": self._arguments, "spec": self.spec}
@@ -164,28 +165,28 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         if actions.shape != shape:  # NumPy would repeat a single action
             raise InputError(f"The actions must have shape {shape}, not {actions.shape}: a row each.")
         if self._ended.any():
-            rewards, terminated = self._step_some(actions)
+            rewards, successes = self._step_some(actions)
         else:
-            self._states, rewards, terminated = self._lanes.step(self._everywhere, actions)
+            self._states, rewards, successes = self._lanes.step(self._everywhere, actions)
             self._steps_left -= 1
             self.steps_taken += self.num_envs
-        truncated = ~terminated & (self._steps_left <= 0)
-        self._ended = terminated | truncated
-        return self._observation(), rewards, terminated, truncated, self._info(terminated)
+        self._ended = successes | (self._steps_left <= 0)
+        terminated = successes & ~self._at_horizon
+        return self._observation(), rewards, terminated, self._ended & ~terminated, self._info(successes)
 
     def _step_some(self, actions: NDArray[np.float32]) -> tuple[NDArray[np.float64], Flags]:
         """Step where an episode goes on, begin the next one elsewhere; return rewards and successes."""
-        rewards, terminated = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
+        rewards, successes = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
         beginning, going = np.flatnonzero(self._ended).tolist(), np.flatnonzero(~self._ended).tolist()
         if going:
             outcomes = self._lanes.step(going, actions[going])
-            self._states[going], rewards[going], terminated[going] = outcomes
+            self._states[going], rewards[going], successes[going] = outcomes
             self._steps_left[going] -= 1
             self.steps_taken += len(going)
         for number in beginning:
             self._starts[number] = self._schedules[number].next(self._generators[number], {})
         self._begin(beginning)
-        return rewards, terminated
+        return rewards, successes
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the worlds; Gymnasium's options of `close` change nothing here."""
@@ -202,6 +203,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
     def _tell(self) -> None:
         """Collect the instructions and infos of the current episodes, which every step repeats."""
         self._tasks = [start.task for start in self._starts]
+        self._at_horizon = np.array([success_at_horizon(task) for task in self._tasks])
         instructions = [start.observed_instruction for start in self._starts]
         self._instructions = tuple(instructions) if self.instruction == "text" else np.stack(instructions)
         rows = [start.info(success=False) for start in self._starts]

@@ -43,6 +43,10 @@ class VectorWorld(Protocol):
     The class that makes the episodes, this one or a plain world without vector world, declares
     `perturbable: ClassVar[bool] = True` if it also takes the keyword argument `perturbed`. Its episodes are
     then perturbed by `clbench.worlds.perturbation.draw_perturbation`. Without the declaration it cannot be.
+
+    A plain world that judges success only at the horizon of its tasks declares
+    `success_at_horizon: ClassVar[bool] = True`, whether it has a vector world or not. A success is then no
+    end of the task: environments report it in `info` and call the episode truncated, not terminated.
     """
 
     single_observation_space: spaces.Box
@@ -98,6 +102,8 @@ class OneLaneWorld(World, ABC):
     """Function that makes the vector world from the number of lanes and the number of threads."""
     first_task: ClassVar[str]
     """Name of the task that `reset` starts if its options name none."""
+    success_at_horizon: ClassVar[bool] = False
+    """Whether success is judged only at the horizon, see `VectorWorld`."""
 
     def __init__(self, render_mode: str | None = None) -> None:
         self.render_mode = render_mode

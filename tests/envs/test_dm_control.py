@@ -155,6 +155,17 @@ def test_success_is_the_return_of_the_whole_episode_and_comes_at_its_last_step()
     assert success == (sum(rewards) >= rules.SUCCESS_SHARE * experts.expert_return(task.name))
 
 
+def test_the_environment_calls_a_success_at_the_horizon_truncated() -> None:
+    env = gymnasium.make("clbench/DMControl-v0", task="point_mass_easy")
+    act, observation = experts.expert("point_mass_easy"), env.reset(seed=0)[0]
+    ends = []
+    for _ in range(SCENARIO.task("point_mass_easy").horizon):
+        observation, _, terminated, truncated, info = env.step(act(observation["state"]))
+        ends.append((terminated, truncated, info["success"]))
+    assert ends == [(False, False, False)] * (len(ends) - 1) + [(False, True, True)]
+    assert env.metadata["render_fps"] == 6.25
+
+
 @pytest.mark.parametrize("task", SCENARIO.tasks, ids=NAMES)
 def test_every_expert_did_its_task_in_nine_of_ten_episodes(task: Task) -> None:
     card = json.loads((experts.FOLDER / f"{task.name}.json").read_text(encoding="utf-8"))

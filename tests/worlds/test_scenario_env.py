@@ -186,6 +186,35 @@ def test_an_episode_ends_with_success_or_at_the_horizon() -> None:
     assert not any(result[2] for result in results)
 
 
+class Patient(ToyWorld):
+    """A world that judges success only at the horizon, the 12th step."""
+
+    success_at_horizon = True
+
+    def reset(self, **options: Any) -> Any:
+        self._steps = 0
+        return super().reset(**options)
+
+    def step(self, action: Any) -> Any:
+        self._steps += 1
+        state, reward, success, _, info = super().step(action)
+        success = success and self._steps == 12
+        return state, reward, success, False, {**info, "success": success}
+
+
+@pytest.mark.parametrize(("speed", "success"), [(-0.5, True), (0.0, False)])
+def test_an_episode_whose_success_is_judged_at_the_horizon_is_truncated_whatever_it_is(
+    speed: float, success: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("clbench.testing.ToyWorld", Patient)
+    env = _toy(task="left")
+    env.reset(seed=0)
+    results = [env.step(np.array([speed, 0], np.float32)) for _ in range(12)]
+    ends = [(terminated, truncated) for _, _, terminated, truncated, _ in results]
+    assert ends == [(False, False)] * 11 + [(False, True)]
+    assert [info["success"] for *_, info in results] == [False] * 11 + [success]
+
+
 def test_steps_add_up_over_episodes_and_the_first_episode_gives_the_time_of_the_start() -> None:
     env, begun = _toy(), []
     assert (env.steps_taken, env.begun_at) == (0, None)

@@ -60,6 +60,11 @@ def test_it_equals_gymnasiums_own_over_the_whole_schedule(instruction: str) -> N
     assert _run_together(TOY, 120, 0.5, instruction=instruction, episodes_per_stage=2) > 20
 
 
+def test_it_does_so_where_success_is_judged_at_the_horizon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ToyWorld, "success_at_horizon", True, raising=False)
+    assert _run_together(TOY, 60, 0.5) > 10
+
+
 @pytest.mark.long
 def test_it_does_so_with_the_suites_own_vector_world() -> None:
     assert _run_together(FETCH, 130, 0.0, instruction="tokens", episodes_per_stage=2) >= 6
