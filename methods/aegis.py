@@ -27,6 +27,11 @@ Details:
 8. The one pass over the questions is no optimiser step: no cost on the board counts it.
 9. The energy of which a share is shed is that of the gradient of the backbone's layers, by our choice. Of all
    trained weights, the share would be smaller.
+10. A batch of the robot is no batch of questions: on FetchKnowledge-v1, its squared distance to the anchor is
+   73 to 119 before the first step, and 2 to 4 after the last step of the first stage. The projection removes
+   only what leads away, so it does not hold the robot's hidden states in place: they move onto those of the
+   questions. With a random direction the distance grows to 168 to 268.
+11. Each variance gets 1e-6 before its root, whose slope is infinite at 0.
 
 `direction="random"` is the control: the same projection against a random direction. (This direction has the
 norm of the anchor's gradient, but the projection does not depend on the norm.)

@@ -44,6 +44,10 @@ Details:
 8. The three values of `tau_start` let no setting of `consft` give differing weights to 10 % of the samples on
    Fetch-v1 and MetaWorld-v1: 5 % at most, with 0.3 (the share that docs/reference/claims.md asks for). They
    end too low: 1, as a `loss_scale` of 0.003, gives such weights to 17 % there, and to 23 % on PointMaze-v1.
+9. Where a stage ends when the target is learned, a `schedule` of 1 ends within the benchmark's warm-up of 15
+   steps: T is 11.5 steps at a step factor of 1, and 21 at 0.3. Low weights and small learning rates then
+   coincide, and little of the conservative phase is ConSFT's alone. The schedule outlasts the warm-up only on
+   PointMaze-v1, with T = 37 at a factor of 1, and on LiberoSpatial-v1, with 40. The paper's T is 2,000.
 
 `ConSFTCalibrated` multiplies the loss by `loss_scale` inside the weight, and keeps the other constants.
 Before the last tenth of the schedule, the published constants give only losses below 0.0024 a weight above

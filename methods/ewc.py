@@ -11,7 +11,8 @@ Details:
    samples, and each target has one of its own: with three skills, a skill counts a third as much as a target.
    The paper adds one importance for each task. An importance is a mean over 256 samples, and noisy: six
    estimates for the same policy have a mean correlation of 0.70, and the five largest samples carry 38 to
-   55 % of the sum.
+   55 % of the sum. Online EWC also multiplies the earlier sum by gamma, and normalises the importance of each
+   task; here gamma is 1, and nothing is normalised.
 3. The penalty is (strength / 2) sum_i F_i (theta_i - theta*_i)^2. Its gradient is added in closed form.
 4. If nothing is retained, no weight is important during the first target.
 5. The gradient of the penalty is clipped together with the loss's, to a norm of 1, and goes through Adam: a

@@ -1,7 +1,7 @@
 """Experience replay: every batch mixes the target with demonstrations of earlier tasks.
 
-Rehearsal as in Rolnick et al. 2019 (arXiv 1811.11682); arXiv 2603.03818 applies it to vision-language-action
-models.
+Rehearsal as in Rolnick et al. 2019 (arXiv 1811.11682), without their terms that also clone the behaviour;
+arXiv 2603.03818 applies it to vision-language-action models.
 
 Details:
 1. Prior data are all demonstrations of the retained skills and of the earlier targets. All tasks are equally

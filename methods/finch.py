@@ -2,14 +2,14 @@
 
 A step can raise the loss on earlier tasks by a bounded amount, which grows with the root of the present loss.
 The learning rate is therefore kappa / sqrt(EMA(L) + eps), capped: steps are small while the loss is high, at
-the start of a target.
+the start of a target. The formula is from a note by another reader; we have not read the paper.
 
 Details:
 1. The cap is the benchmark's own schedule instead of the paper's constant 5e-5, so that FINCH takes no larger
    steps than plain fine-tuning. kappa is therefore a factor of that schedule.
 2. The default of kappa comes from validation episodes of the first Fetch board (docs/history.md).
    Where methods are tuned, `clbench tune` chose again.
-3. The average restarts with the first loss of each target.
+3. The average restarts with the first loss of each target. The eps is 1e-8.
 """
 
 import math

@@ -27,7 +27,7 @@ INTRODUCTION = (
     "written before the records of these boards, but some changed later: the list says how many, each rule "
     "says when, and docs/history.md says why. Four choices were made when the records of these boards were "
     "already known: to judge C1 on clbench/LiberoSpatial-v1, A5 on clbench/FetchKnowledge-v1 and A2 on "
-    "clbench/Fetch-v1 and clbench/MetaWorld-v1, and to judge A6 by a different quantity. "
+    "clbench/Fetch-v1 and clbench/MetaWorld-v1, and to judge A6 by other quantities. "
     "One review of the rules turned 15 "
     'of 41 verdicts without a new record, 13 of them into "cannot be shown here"; docs/history.md lists '
     "them, and says that boards got more seeds after a first look. `sft` is plain fine-tuning. Most claims "
@@ -42,7 +42,8 @@ INTRODUCTION = (
     "the threshold. Some rules judge two versions of a method, called arms, and hold if either arm satisfies "
     "them. Such a rule is wrong up to twice as often, and its first figure is the larger of the two. "
     "A rule that needs all its figures is wrong less often. A "
-    'rule that asks for an interval needs {seeds} seeds. "Cannot be shown here" means that a condition of '
+    "rule that asks for an interval needs {seeds} seeds; only the speed in F6 is of one policy. "
+    '"Cannot be shown here" means that a condition of '
     "the rule is missing, so that no figure speaks for or against the claim; a sentence says which. "
     "`consft` is the published loss. Its authors tune the first temperature and the length of the schedule "
     "for each task; here tuning chose only the temperature, among 0.003, which is published, 0.03 and 0.3, "

@@ -37,7 +37,10 @@ def observation(batch: int, seed: int = 0) -> tuple[list[Tensor], Tensor]:
 
 
 def algorithm_1(made: DiscreteDiffusionHead, hidden: Any, mask: Tensor, told: Thresholds) -> tuple[Any, int]:
-    """Decode one chunk as the paper writes it, with loops over blocks and tokens; return tokens, forwards."""
+    """Decode one chunk with loops over blocks and tokens, and return the tokens and the forwards.
+
+    It is as the paper writes it, but for details 1 and 3 of the decoder.
+    """
     size = (made.block or CHUNK) * ACTION
     tokens, begun, active = [made.bins] * LENGTH, 1, {0}
 

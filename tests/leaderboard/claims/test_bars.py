@@ -309,6 +309,21 @@ def test_consft_is_also_compared_with_plain_fine_tuning_at_its_own_learning_rate
         assert (f"{what}, consft - sft@0.3" in names) is shown
 
 
+@pytest.mark.parametrize(("factor", "control"), [(0.1, "sft"), (0.101, "sft@0.03")])
+def test_plain_fine_tuning_that_is_tuned_to_small_steps_is_its_own_control(
+    factor: float, control: str
+) -> None:
+    settings = {"step_factor": factor}
+    run = SimpleNamespace(record=SimpleNamespace(run=SimpleNamespace(settings=settings)))
+    given: Given = {
+        **BOTH,
+        "update sparsity, consft - sft": (-0.1, 0.0),
+        "update sparsity, consft_calibrated - sft": (-0.1, 0.0),
+        f"update sparsity, {control} - sft@1": (0.0, 0.049),
+    }
+    assert judged("C4", given, {"sft": {0: run}}).verdict == "cannot be shown here"
+
+
 @pytest.mark.parametrize(("half", "verdict"), [(True, "holds"), (False, "holds in part")])
 def test_a_loss_after_half_of_the_stage_is_not_rapid(
     half: bool, verdict: str, monkeypatch: pytest.MonkeyPatch
