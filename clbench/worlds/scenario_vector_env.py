@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from copy import copy
 from typing import Any
 
 import gymnasium
@@ -32,9 +31,11 @@ Outcome = tuple[Observation, NDArray[np.float64], Flags, Flags, dict[str, Any]]
 class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     """Many `ScenarioEnv`, each with its own schedule, stepped together by the suite's vector world.
 
-    It equals a `gymnasium.vector.SyncVectorEnv` of them bit for bit: an environment whose episode has ended
-    begins the next one at the next step, which ignores its action. A copy made by pickle is a new vector,
-    which begins with its own first `reset()`.
+    What `reset` and `step` return, the spaces, `np_random` and `np_random_seed` equal those of a
+    `gymnasium.vector.SyncVectorEnv` of them bit for bit, in all modes of autoreset. Errors have other types
+    and texts. There are no single environments: `envs`, `call`, `get_attr`, `set_attr` and `render` are
+    missing, and `gymnasium.make_vec(..., vectorization_mode="sync")` has them. A copy made by pickle is a new
+    vector, which begins with its own first `reset()`.
 
     Args:
         scenario: Scenario, or its entry point "module:attribute".
@@ -47,12 +48,16 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         threads: Threads that step the worlds, by default one per core, at most one per environment.
             Results do not depend on it.
         render_mode: None; environments side by side cannot be drawn.
+        autoreset_mode: When an environment whose episode has ended begins the next one. `NEXT_STEP` begins it
+            at the next step, which ignores its action. `SAME_STEP` begins it at once; the infos then hold
+            what the episode ended with, as `final_obs` and `final_info`. `DISABLED` leaves it to `reset` with
+            the option "reset_mask".
 
     Raises:
         MissingPackageError: A package that the tasks need is not installed; the message says how to get it.
     """
 
-    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
 
     def __init__(
         self,
@@ -65,8 +70,12 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         task: str | None = None,
         threads: int | None = None,
         render_mode: str | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
     ) -> None:
-        self._arguments = (scenario, num_envs, instruction, episodes_per_stage, stage, order, task, threads)
+        self._arguments = (
+            *(scenario, num_envs, instruction, episodes_per_stage, stage, order, task, threads, render_mode),
+            autoreset_mode,
+        )
         if render_mode is not None:
             raise InputError(
                 "Many environments side by side cannot be drawn. Draw one with gymnasium.make(...), or give "
@@ -76,6 +85,8 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         if num_envs < 1:
             raise InputError(f"num_envs must be at least 1, not {num_envs}.")
         self.num_envs = num_envs
+        self.autoreset_mode = _mode(autoreset_mode)
+        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.instruction: InstructionFormat = instruction
         self.stage, self.order = stage, order
         self.steps_taken = 0
@@ -85,7 +96,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         self._schedules = [
             Schedule(self.scenario, episodes_per_stage, instruction, stage, task) for _ in range(num_envs)
         ]
-        self._generators: list[np.random.Generator] = [np_random()[0] for _ in range(num_envs)]
+        self._generators = [np_random() for _ in range(num_envs)]
         self._lanes = Lanes(num_envs, min(num_envs, threads or cores()))  # more would never get work
         first = self.scenario.tasks[0]
         world = self._lanes.world(first)
@@ -96,11 +107,11 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         )
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._starts: list[Start] = []
+        self._starts: dict[int, Start] = {}
         self._tasks: list[Task] = []
         self._everywhere = list(range(num_envs))
         self._known = np.ones(num_envs, np.bool_)
-        self._instructions: tuple[str, ...] | NDArray[np.int64] = ()
+        self._instructions: list[Any] = []
         self._told: dict[str, NDArray[Any]] = {}
         self._states = np.zeros((num_envs, *world.single_observation_space.shape), np.float32)
         self._steps_left = np.zeros(num_envs, np.int64)
@@ -114,31 +125,59 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         ScenarioVectorEnv.__init__(self, *state["arguments"])
         self.spec = state["spec"]
 
+    @property
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
+        """The generators of the environments, as `SyncVectorEnv` has them."""
+        return tuple(generator for generator, _ in self._generators)
+
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
+        """The seeds of these generators."""
+        return tuple(seed for _, seed in self._generators)
+
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode in every environment.
+        """Begin an episode in every environment, or in those that the option "reset_mask" names.
 
         Args:
             seed: Seed of the first environment, from which the others count up, or a seed or None for each.
-            options: Options of `ScenarioEnv.reset`, for all environments. A task holds for one episode.
+            options: Options of `ScenarioEnv.reset`, for all environments. A task holds for one episode. With
+                "reset_mask", an array (N,) of bool, the other environments go on with their episodes.
 
         Raises:
+            ResetNeeded: A first `reset` has a mask.
             UnknownNameError: The scenario has no such task.
             InputError: It has no such stage, an option is unknown, or the number of seeds is wrong.
             WrongTypeError: A seed is no whole number.
         """
         self.begun_at = self.begun_at or time.perf_counter()
-        seeds = self._seeds(seed)
-        for number, own in enumerate(seeds):
-            if own is not None:
-                self._generators[number], _ = np_random(own)
+        options = dict(options or {})
+        numbers, seeds = self._chosen(options.pop("reset_mask", None)), self._seeds(seed)
+        for number in numbers:
+            if (own := seeds[number]) is not None:
+                self._generators[number] = np_random(own)
                 self._schedules[number].begin()
-        schedules = zip(self._schedules, self._generators, strict=True)
-        self._starts = [schedule.next(generator, options or {}) for schedule, generator in schedules]
-        self._begin(self._everywhere)
-        self._ended = np.zeros(self.num_envs, np.bool_)
-        return self._observation(), self._info(self._ended)
+        self._begin(numbers, options)
+        self._ended[numbers] = False
+        info: dict[str, Any] = {}
+        for number in numbers:
+            info = self._add_info(info, self._starts[number].info(success=False), number)
+        return self._observation(self._everywhere), info
+
+    def _chosen(self, mask: Any) -> list[int]:
+        """Return the environments that begin an episode: all, or those of a mask."""
+        if mask is None:
+            return self._everywhere
+        is_mask = isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.shape == (self.num_envs,)
+        if not is_mask or not mask.any():
+            raise InputError(
+                f'The option "reset_mask" must be an array ({self.num_envs},) of bool, at least one of them '
+                f"True, not {mask!r}."
+            )
+        if not self._starts:
+            raise gymnasium.error.ResetNeeded(f"{self.scenario.id} has no episodes yet: first reset all.")
+        return np.flatnonzero(mask).tolist()
 
     def _seeds(self, seed: Any) -> Sequence[int | None]:
         if seed is None:
@@ -153,10 +192,10 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         return [None if one is None else int(one) for one in seeds]
 
     def step(self, actions: NDArray[np.float32]) -> Outcome:
-        """Take one step in every environment; where the last one ended an episode, begin the next instead.
+        """Take one step in every environment; `autoreset_mode` tells where the next episode begins.
 
         Raises:
-            ResetNeeded: There was no `reset` yet.
+            ResetNeeded: There was no `reset` yet, or without autoreset, an episode has ended.
             InputError: There is not one action for each environment.
         """
         if not self._starts:
@@ -165,6 +204,11 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         if actions.shape != shape:  # NumPy would repeat a single action
             raise InputError(f"The actions must have shape {shape}, not {actions.shape}: a row each.")
         if self._ended.any():
+            if self.autoreset_mode is AutoresetMode.DISABLED:
+                raise gymnasium.error.ResetNeeded(
+                    f"Episodes of {self.scenario.id} have ended, in the environments "
+                    f'{np.flatnonzero(self._ended).tolist()}: reset them, with the option "reset_mask".'
+                )
             rewards, successes = self._step_some(actions)
         else:
             self._states, rewards, successes = self._lanes.step(self._everywhere, actions)
@@ -172,7 +216,23 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
             self.steps_taken += self.num_envs
         self._ended = successes | (self._steps_left <= 0)
         terminated = successes & ~self._at_horizon
-        return self._observation(), rewards, terminated, self._ended & ~terminated, self._info(successes)
+        truncated = self._ended & ~terminated
+        final = {}
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and self._ended.any():
+            final = self._finished(np.flatnonzero(self._ended).tolist(), successes)
+            successes, self._ended = successes & ~self._ended, np.zeros(self.num_envs, np.bool_)
+        info = {**final, **self._info(successes)}
+        return self._observation(self._everywhere), rewards, terminated, truncated, info
+
+    def _finished(self, numbers: list[int], successes: Flags) -> dict[str, Any]:
+        """Begin the next episodes of the environments `numbers`, and return what the last ones ended with."""
+        shown, info = self._observation(numbers), {}
+        for row, number in enumerate(numbers):
+            told = self._starts[number].info(bool(successes[number]))
+            last = {name: values[row] for name, values in shown.items()}
+            info = self._add_info(info, {"final_obs": last, "final_info": told}, number)
+        self._begin(numbers, {})
+        return info
 
     def _step_some(self, actions: NDArray[np.float32]) -> tuple[NDArray[np.float64], Flags]:
         """Step where an episode goes on, begin the next one elsewhere; return rewards and successes."""
@@ -183,18 +243,17 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
             self._states[going], rewards[going], successes[going] = outcomes
             self._steps_left[going] -= 1
             self.steps_taken += len(going)
-        for number in beginning:
-            self._starts[number] = self._schedules[number].next(self._generators[number], {})
-        self._begin(beginning)
+        self._begin(beginning, {})
         return rewards, successes
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the worlds; Gymnasium's options of `close` change nothing here."""
         self._lanes.close()
 
-    def _begin(self, numbers: Sequence[int]) -> None:
-        """Put the environments `numbers` at their starts."""
-        starts = [self._starts[number] for number in numbers]
+    def _begin(self, numbers: Sequence[int], options: dict[str, Any]) -> None:
+        """Begin the next episodes of the environments `numbers`, or those that the options choose."""
+        starts = [self._schedules[number].next(self._generators[number][0], options) for number in numbers]
+        self._starts.update(zip(numbers, starts, strict=True))
         tasks = [start.task for start in starts]
         self._states[numbers] = self._lanes.reset(numbers, [start.seed for start in starts], tasks)
         self._steps_left[numbers] = [task.horizon for task in tasks]
@@ -202,11 +261,11 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
 
     def _tell(self) -> None:
         """Collect the instructions and infos of the current episodes, which every step repeats."""
-        self._tasks = [start.task for start in self._starts]
+        starts = list(self._starts.values())
+        self._tasks = [start.task for start in starts]
         self._at_horizon = np.array([success_at_horizon(task) for task in self._tasks])
-        instructions = [start.observed_instruction for start in self._starts]
-        self._instructions = tuple(instructions) if self.instruction == "text" else np.stack(instructions)
-        rows = [start.info(success=False) for start in self._starts]
+        self._instructions = [start.observed_instruction for start in starts]
+        rows = [start.info(success=False) for start in starts]
         self._told = {
             name: np.array(
                 [row[name] for row in rows], dtype=object if isinstance(value, str) else type(value)
@@ -214,10 +273,14 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
             for name, value in rows[0].items()
         }
 
-    def _observation(self) -> Observation:
-        state, image = self._lanes.observe(self._everywhere, self._tasks, self._states)
+    def _observation(self, numbers: list[int]) -> Observation:
+        """Return the observations of the environments `numbers`, which later steps leave as they are."""
+        tasks = [self._tasks[number] for number in numbers]
+        state, image = self._lanes.observe(numbers, tasks, self._states[numbers])
         images = {"image": image} if image.size else {}
-        return {"state": state.copy(), **images, "instruction": copy(self._instructions)}
+        words = [self._instructions[number] for number in numbers]
+        instruction = tuple(words) if self.instruction == "text" else np.stack(words)
+        return {"state": state, **images, "instruction": instruction}
 
     def _info(self, successes: Flags) -> dict[str, Any]:
         """Return the infos as columns with masks, in the form of Gymnasium's vector environments."""
@@ -225,3 +288,14 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         for name, column in {**self._told, "success": successes}.items():
             info[name], info[f"_{name}"] = column.copy(), self._known.copy()
         return info
+
+
+def _mode(chosen: str | AutoresetMode) -> AutoresetMode:
+    """Return a mode of autoreset by its name, such as "SameStep"."""
+    try:
+        return AutoresetMode(chosen)
+    except ValueError as error:
+        names = ", ".join(f'"{mode.value}"' for mode in AutoresetMode)
+        raise InputError(
+            f"autoreset_mode must be an AutoresetMode or one of {names}, not {chosen!r}."
+        ) from error

@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.vector import VectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv
 
 from clbench.testing import ToyWorld
 from clbench.worlds.lanes import PlainVectorWorld
@@ -26,6 +26,8 @@ def _same(first: Any, second: Any) -> None:
     elif isinstance(first, tuple):
         for value, other in zip(first, second, strict=True):
             _same(value, other)
+    elif isinstance(first, np.ndarray) and first.dtype == object:
+        _same(tuple(first), tuple(second))
     elif isinstance(first, np.ndarray):
         assert first.dtype == second.dtype
         np.testing.assert_array_equal(first, second)
@@ -33,11 +35,16 @@ def _same(first: Any, second: Any) -> None:
         assert first == second
 
 
-def _run_together(scenario: str, steps: int, towards: float, **options: Any) -> int:
+def _run_together(scenario: str, steps: int, towards: float, mode: str = "NextStep", **options: Any) -> int:
     """Step ours and Gymnasium's in turn, and return how many episodes ended."""
-    ours: VectorEnv[Any, Any, Any] = gymnasium.make_vec(scenario, num_envs=3, threads=2, **options)
-    plain = gymnasium.make_vec(scenario, num_envs=3, vectorization_mode="sync", **options)
+    ours: VectorEnv[Any, Any, Any] = gymnasium.make_vec(
+        scenario, num_envs=3, threads=2, autoreset_mode=mode, **options
+    )
+    plain = gymnasium.make_vec(
+        scenario, num_envs=3, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, **options
+    )
     assert isinstance(ours, ScenarioVectorEnv)
+    assert ours.metadata["autoreset_mode"] is plain.metadata["autoreset_mode"]
     assert ours.observation_space == plain.observation_space
     assert ours.action_space == plain.action_space
     generator, ended = np.random.default_rng(0), 0
@@ -48,21 +55,26 @@ def _run_together(scenario: str, steps: int, towards: float, **options: Any) -> 
         outcome = ours.step(actions)
         _same(outcome, plain.step(actions))
         assert outcome[0] in ours.observation_space
-        ended += int((outcome[2] | outcome[3]).sum())
+        mask = outcome[2] | outcome[3]
+        ended += int(mask.sum())
+        if mode == "Disabled" and mask.any():
+            masks = [{"reset_mask": mask.copy()} for _ in range(2)]
+            _same(ours.reset(options=masks[0]), plain.reset(options=masks[1]))
     _same(ours.reset(), plain.reset())
     ours.close()
     plain.close()
     return ended
 
 
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
 @pytest.mark.parametrize("instruction", ["text", "tokens"])
-def test_it_equals_gymnasiums_own_over_the_whole_schedule(instruction: str) -> None:
-    assert _run_together(TOY, 120, 0.5, instruction=instruction, episodes_per_stage=2) > 20
+def test_it_equals_gymnasiums_own_over_the_whole_schedule(instruction: str, mode: str) -> None:
+    assert _run_together(TOY, 120, 0.5, mode, instruction=instruction, episodes_per_stage=2) > 20
 
 
 def test_it_does_so_where_success_is_judged_at_the_horizon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ToyWorld, "success_at_horizon", True, raising=False)
-    assert _run_together(TOY, 60, 0.5) > 10
+    assert _run_together(TOY, 60, 0.5, "SameStep") > 10
 
 
 @pytest.mark.long
@@ -120,6 +132,55 @@ def test_steps_of_all_environments_add_up_without_those_that_only_begin_an_episo
     assert (env.steps_taken, env.begun_at) == (expected, begun)
 
 
+@pytest.mark.parametrize("seed", [None, 5, [7, None], [None, 8]])
+def test_generators_and_their_seeds_are_those_of_gymnasiums_own(seed: Any) -> None:
+    found = []
+    for env in (_toy(), gymnasium.make_vec(TOY, num_envs=2, vectorization_mode="sync")):
+        env.reset(seed=[3, 4])
+        env.reset(seed=seed)
+        states = [generator.bit_generator.state for generator in env.np_random]
+        found.append((type(env.np_random), env.np_random_seed, states))
+    assert found[0] == found[1]
+
+
+def test_a_seed_with_a_mask_restarts_the_chosen_environments_alone() -> None:
+    mask = np.array([False, True])
+    outcomes: list[Any] = []
+    for env in (_toy(), gymnasium.make_vec(TOY, num_envs=2, vectorization_mode="sync")):
+        env.reset(seed=0)
+        env.step(np.zeros((2, 2), np.float32))
+        again = env.reset(seed=9, options={"reset_mask": mask.copy(), "task": "up"})
+        outcomes.append((again, env.np_random_seed, env.step(np.zeros((2, 2), np.float32))))
+    _same(*outcomes)
+    assert outcomes[0][1] == (0, 10)
+
+
+@pytest.mark.parametrize(
+    "mask", [[True, False], np.array([1, 0]), np.array([True]), np.array([False, False]), True]
+)
+def test_a_mask_that_chooses_no_environments_is_refused(mask: Any) -> None:
+    env = _toy(autoreset_mode="Disabled")
+    with pytest.raises(gymnasium.error.ResetNeeded, match="first reset all"):
+        env.reset(options={"reset_mask": np.array([True, False])})
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r'The option "reset_mask" must be an array \(2,\) of bool'):
+        env.reset(options={"reset_mask": mask})
+
+
+def test_without_autoreset_a_step_after_the_end_is_refused_with_what_to_do() -> None:
+    env = _toy(autoreset_mode=AutoresetMode.DISABLED)
+    env.reset(seed=0, options={"task": "left"})
+    actions = np.array([[-1.0, 0.0], [1.0, 0.0]], np.float32)
+    while not env.step(actions)[2].any():
+        pass
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r'in the environments \[0\]: .*"reset_mask"'):
+        env.step(actions)
+    with pytest.raises(
+        ValueError, match='must be an AutoresetMode or one of "NextStep", "SameStep", "Disabled"'
+    ):
+        _toy(autoreset_mode="same")
+
+
 def test_after_a_reset_no_episode_that_had_ended_begins_once_more() -> None:
     envs = [_toy(), gymnasium.make_vec(TOY, num_envs=2, vectorization_mode="sync")]
     actions = np.array([[-1.0, 0.0], [1.0, 0.0]], np.float32)
@@ -146,10 +207,12 @@ def test_a_seed_that_is_no_whole_number_is_refused(seed: Any) -> None:
 
 
 def test_a_copy_by_pickle_is_a_new_vector_with_the_same_arguments() -> None:
-    env: Any = gymnasium.make_vec(TOY, num_envs=2, instruction="tokens", stage=1)
+    same_step = AutoresetMode.SAME_STEP
+    env: Any = gymnasium.make_vec(TOY, 2, instruction="tokens", stage=1, autoreset_mode=same_step)
     first = env.reset(seed=3)
     copy = pickle.loads(pickle.dumps(env))
     assert (copy.spec, copy.num_envs, copy.stage) == (env.spec, 2, 1)
+    assert copy.metadata["autoreset_mode"] is same_step
     with pytest.raises(gymnasium.error.ResetNeeded):
         copy.step(copy.action_space.sample())
     _same(copy.reset(seed=3), first)
