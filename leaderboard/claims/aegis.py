@@ -319,7 +319,7 @@ def removes_drift(evidence: Evidence) -> Finding:
         decided(holds=near_enough and on_questions.high < 0.5, in_part=near_enough, fails=near.low > 0.5),
         (near, on_questions),
         (first, last, *(anchor_distance(evidence, RANDOM, end) for end in ENDS), at_random),
-        (*_where_it_begins(first, last), *_on_questions(on_questions)),
+        (*_on_questions(on_questions), *_where_it_begins(first, last)),
         what_would_change(on_questions if near_enough else near, 0.5),
     )
 

@@ -95,8 +95,8 @@ class Claim:
     """Gymnasium ids of the scenarios on which it is judged."""
     judge: Callable[[Evidence], Finding]
     """Function that applies the rule."""
-    ours: bool = False
-    """Whether it is our reading of the paper, which does not state it in so many words."""
+    uncounted: str = ""
+    """Why its verdicts are not counted with the paper's; empty if they are."""
 
 
 def claim(
@@ -108,14 +108,14 @@ def claim(
     settled: str,
     margin: str,
     scenarios: tuple[str, ...] = BOARDS,
-    ours: bool = False,
+    uncounted: str = "",
 ) -> Callable[[Callable[[Evidence], Finding]], Claim]:
     """Return a decorator that makes a claim of the function that judges it; its docstring is the claim."""
 
     def enter(judge: Callable[[Evidence], Finding]) -> Claim:
         words = " ".join((judge.__doc__ or "").split())
         since = datetime.fromisoformat(settled)
-        return Claim(identifier, paper, words, reported, rule, since, margin, scenarios, judge, ours)
+        return Claim(identifier, paper, words, reported, rule, since, margin, scenarios, judge, uncounted)
 
     return enter
 

@@ -307,6 +307,7 @@ def _small_steps(evidence: Evidence) -> str:
     settled="2026-11-23T07:13Z",
     margin="none: an identity",
     scenarios=ANYWHERE,
+    uncounted="algebra",
 )
 def risk_has_the_square_of_the_weight(evidence: Evidence) -> Finding:
     """The risk of one sample's gradient scales with the square of the sample's weight."""

@@ -39,7 +39,7 @@ from .figures import perturbation_gain, perturbation_loss
     "here if no arm counts.",
     settled="2026-11-27T20:50Z",
     margin="0.10 of the success on earlier targets",
-    ours=True,
+    uncounted="our reading of the paper",
 )
 def keeps_earlier_targets(evidence: Evidence) -> Finding:
     """Learns several targets in sequence and keeps the earlier ones."""

@@ -171,9 +171,10 @@ def _claims(judged: Sequence[Judged]) -> Section:
     """Which claims of the papers hold."""
     answers = []
     for paper, every in grouped((one.claim.paper.name, one) for one in judged).items():
+        counted_ones = [one for one in every if not one.claim.uncounted]
         answers.append(
-            f"{paper}: {tally(one.finding.verdict for one in every if not one.claim.ours)}."
-            f"{_those_that_hold(every)}{_ours(every)}"
+            f"{paper}: {tally(one.finding.verdict for one in counted_ones)}."
+            f"{_those_that_hold(counted_ones)}{_uncounted(every)}"
         )
     boards = tuple(dict.fromkeys(one.evidence.scenario for one in judged))
     found = grouped((one.claim, one) for one in judged)
@@ -242,7 +243,7 @@ MADE_FOR_IT = "the one scenario that was made to show it, by training far past l
 
 
 def _those_that_hold(judged: Sequence[Judged]) -> str:
-    """Return in sentences which claims hold, some in part: they may be about sft, costs, or algebra."""
+    """Return in sentences which claims hold, some in part: they may be about sft or costs."""
     sentences = []
     for verdict, opening in (("holds", "What holds"), ("holds in part", "What holds in part")):
         boards = grouped((one.claim, one.finding.verdict == verdict) for one in judged)
@@ -257,11 +258,11 @@ def _those_that_hold(judged: Sequence[Judged]) -> str:
     return "".join(sentences)
 
 
-def _ours(judged: Sequence[Judged]) -> str:
-    """Return in a sentence which claims are our reading of a paper; they are not counted."""
-    found = grouped((one.claim.id, one.finding.verdict) for one in judged if one.claim.ours)
+def _uncounted(judged: Sequence[Judged]) -> str:
+    """Return in a sentence which claims are not counted, and why."""
+    found = grouped((one.claim, one.finding.verdict) for one in judged if one.claim.uncounted)
     return "".join(
-        f" {claim} is our reading of the paper and is not counted: {tally(verdicts)}."
+        f" {claim.id} is {claim.uncounted} and is not counted: {tally(verdicts)}."
         for claim, verdicts in found.items()
     )
 

@@ -321,7 +321,7 @@ def test_the_distance_to_the_anchor_is_that_of_the_same_seed_with_a_random_direc
     near, drift = finding.figures
     assert finding.verdict == "holds in part"
     assert near.value == pytest.approx((0.010 * 0.011 * 0.009) ** (1 / 3))
-    begins, on_questions = finding.sentences
+    on_questions, begins = finding.sentences
     assert "their squared distance to the anchor is 91 before the first step. It ends at 3.4." in begins
     assert "drift 0.82 [0." in on_questions
     assert drift.value == pytest.approx(0.82, abs=0.005)

@@ -154,25 +154,39 @@ def test_a_gain_that_is_not_certain_over_a_tied_setting_is_no_yes(
     )
 
 
+def judged(identifier: str, board: str, verdict: str, what: str, *sentences: str) -> Any:
+    """Return a claim of the project with a verdict on a board."""
+    claim = resolve("clbench.leaderboard.claims.judges:CLAIMS")[identifier]
+    figure = resolve("clbench.leaderboard.claims.evidence:Figure")
+    value = figure(what, ("consft", "sft"), Estimate(0.25, 0.125, 0.5))
+    finding = resolve("clbench.leaderboard.claims.claim:Finding")
+    found = finding(verdict, (value,), (), sentences, "Longer stages.")
+    return SimpleNamespace(claim=claim, evidence=SimpleNamespace(scenario=board), finding=found)
+
+
 def test_claims_that_hold_are_named_since_some_are_about_plain_fine_tuning(
+    even_board: Callable[..., Path], page: Callable[[], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    every = (judged("C1", "a", "holds", "lost"), judged("C1", "b", "undecided", "lost"))
+    monkeypatch.setattr("clbench.leaderboard.claims.judges.judge_all", lambda *_: every)
+    fill(even_board, sft=0.4)
+    words = "C1, Fine-tuning without constraint degrades pretrained skills (on 1 of 2 boards)."
+    assert f"of 2 verdicts, 1 holds and 1 is undecided. What holds: {words}" in page()
+
+
+def test_a_claim_that_is_algebra_is_not_counted_with_those_that_records_judge(
     even_board: Callable[..., Path], page: Callable[[], str]
 ) -> None:
     fill(even_board, sft=0.4)
-    assert "What holds: C5, Bounds how much a step can disrupt" in page()
+    text = page()
+    assert "C5 is algebra and is not counted: of 1 verdict, 1 holds." in text
+    assert "What holds: C5" not in text
 
 
 def test_a_claim_is_a_line_with_a_verdict_for_each_board_what_explains_it_and_what_is_missing(
     even_board: Callable[..., Path], page: Callable[[], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first, second, made = map(resolve("clbench.leaderboard.claims.judges:CLAIMS").get, ("C2", "C7", "A4"))
-    finding = resolve("clbench.leaderboard.claims.claim:Finding")
-    figure = resolve("clbench.leaderboard.claims.evidence:Figure")
-
-    def judged(claim: Any, board: str, verdict: str, what: str, *sentences: str) -> Any:
-        value = figure(what, ("consft", "sft"), Estimate(0.25, 0.125, 0.5))
-        found = finding(verdict, (value,), (), sentences, "Longer stages.")
-        return SimpleNamespace(claim=claim, evidence=SimpleNamespace(scenario=board), finding=found)
-
+    first, second, made = "C2", "C7", "A4"
     every = (
         judged(first, "a", "does not hold", "kept", "Half are 0.", "A constant weight keeps as much."),
         judged(first, "b", "does not hold", "kept", "A constant weight keeps as much."),
