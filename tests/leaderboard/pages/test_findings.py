@@ -186,14 +186,13 @@ def test_a_claim_that_is_algebra_is_not_counted_with_those_that_records_judge(
 def test_a_claim_is_a_line_with_a_verdict_for_each_board_what_explains_it_and_what_is_missing(
     even_board: Callable[..., Path], page: Callable[[], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first, second, made = "C2", "C7", "A4"
     every = (
-        judged(first, "a", "does not hold", "kept", "Half are 0.", "A constant weight keeps as much."),
-        judged(first, "b", "does not hold", "kept", "A constant weight keeps as much."),
-        judged(first, "c", "cannot be shown here", "kept", "It has no arm."),
-        judged(second, "b", "undecided", "lost", "Nothing explains it."),
-        judged(second, "c", "cannot be shown here", "lost in c"),
-        judged(made, "d", "does not hold", "answers", "It keeps none."),
+        judged("C2", "a", "does not hold", "kept", "Half are 0.", "A constant weight keeps as much."),
+        judged("C2", "b", "does not hold", "kept", "A constant weight keeps as much."),
+        judged("C2", "c", "cannot be shown here", "kept", "It has no arm."),
+        judged("C7", "b", "undecided", "lost", "Nothing explains it."),
+        judged("C7", "c", "cannot be shown here", "lost in c"),
+        judged("A4", "d", "does not hold", "answers", "It keeps none."),
     )
     monkeypatch.setattr("clbench.leaderboard.claims.judges.judge_all", lambda *_: every)
     fill(even_board, sft=0.4)
@@ -209,8 +208,8 @@ def test_a_claim_is_a_line_with_a_verdict_for_each_board_what_explains_it_and_wh
     assert "| id | claim | first figure | a | b | c | d |\n" in section
     value, none = "0.25 [0.12, 0.50]", "cannot be shown here"
     cells = f"kept | does not hold: {value} | does not hold: {value} | {none}: {value} |  |"
-    assert f"| C2 | {first.words} | {cells}\n" in section
-    assert f"| C7 | {second.words} | lost |  | undecided: {value} | {none} |  |\n" in section
+    assert f"| C2 | {every[0].claim.words} | {cells}\n" in section
+    assert f"| C7 | {every[3].claim.words} | lost |  | undecided: {value} | {none} |  |\n" in section
 
 
 @pytest.mark.parametrize("other", ["skill_0", "skill_1"])
