@@ -172,7 +172,7 @@ class ServedPolicy:
     def _late(self) -> InputError:
         return InputError(
             f"The policy at {self.address} did not answer within {self._timeout:g} seconds: a slower one "
-            "needs a larger --timeout."
+            "needs a larger --timeout, and so does one that answers other clients first."
         )
 
     def _receive(self, connection: ClientConnection) -> Any:

@@ -40,6 +40,7 @@ from typing import TYPE_CHECKING, Any
 import msgpack
 import numpy as np
 from websockets.exceptions import ConnectionClosed
+from websockets.protocol import State
 from websockets.sync.server import Server, ServerConnection
 from websockets.sync.server import serve as listen
 
@@ -209,6 +210,9 @@ def open_server(
             for message in connection:
                 try:
                     with lock:
+                        # it waited for others: if its client has given up, nobody reads the reply
+                        if connection.protocol.state is not State.OPEN:
+                            return
                         reply = _answer(policy, message)
                 except (Exception, SystemExit):  # whatever the policy raises: the client shows it
                     traceback.print_exc()

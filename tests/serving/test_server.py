@@ -4,6 +4,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -154,6 +155,33 @@ def test_the_metadata_come_first_and_each_request_has_a_reply() -> None:
             assert np.array_equal(received(connection)["actions"], 2 * state[:, None])
         with urllib.request.urlopen(f"http://localhost:{port}/healthz") as answer:
             assert answer.read() == b"OK\n"
+
+
+def test_a_request_whose_client_has_gone_while_it_waited_is_not_computed() -> None:
+    begun, may_end, calls = threading.Event(), threading.Event(), list[float]()
+
+    def slow(observations: dict[str, Any]) -> Any:
+        calls.append(float(observations["state"][0, 0]))
+        begun.set()
+        may_end.wait(60)
+        return observations["state"][:, None]
+
+    def ask(connection: ClientConnection, number: int) -> None:
+        assert received(connection) == {}
+        connection.send(pack({"state": np.full((1, 3), number, np.float32)}))
+
+    with connected(slow) as (first, port):
+        ask(first, 1)
+        assert begun.wait(60)
+        with connect(f"ws://localhost:{port}", proxy=None) as impatient:
+            ask(impatient, 2)
+            time.sleep(0.2)  # until its request waits for the policy
+        with connect(f"ws://localhost:{port}", proxy=None) as patient:
+            ask(patient, 3)
+            may_end.set()
+            assert received(patient)["actions"].tolist() == [[[3.0] * 3]]
+        assert received(first)["actions"].tolist() == [[[1.0] * 3]]
+    assert calls == [1, 3]
 
 
 def test_a_page_in_a_browser_cannot_use_a_policy() -> None:
