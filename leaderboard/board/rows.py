@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from clbench.records.paths import check_folder
+from clbench.records.pinned import machine_of
 from clbench.records.record import ScenarioInfo
 from clbench.runs.tuning import CONTROL_OF, tuned
 from clbench.scoring.groups import groups
@@ -27,7 +28,7 @@ from .agreement import Concordance, concordance
 from .costs import costs_of
 from .frontier import Curve, TiedGain, frontiers_of, ladder_of, read_ladder, side_of_zero, tied_gains
 from .orders import Orders, orders_of
-from .runs import ALIKE, Run, Sifted, mean_of, read_run, read_runs, sift_by
+from .runs import ALIKE, Run, Sifted, mean_of, read_run, read_runs, sift_by, unlike_the_pin
 from .summary import (
     DIVISIONS,
     ELSEWHERE,
@@ -97,6 +98,7 @@ def compute_board(records: Path, only: Container[str] | None = None) -> Board:
         scenarios={run.table: run.published for run in runs},
         rows=tuple(chain.from_iterable(found)),
         starts={name: pretrained_success(rows) for name, rows in by_name.items()},
+        machines={run.table: machine_of(run.record.fingerprint) or "" for run in runs if unlike_the_pin(run)},
         unpaired={name: others for name, rows in by_name.items() if (others := unpaired(rows))},
         agreements={name: agreement(rows) for name, rows in by_name.items()},
         not_shown=tuple(sorted([*not_shown, *alone, *without], key=lambda entry: entry.path)),

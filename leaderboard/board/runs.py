@@ -287,23 +287,29 @@ def same_simulator(runs: list[Run]) -> Sifted:
 def same_definition(runs: list[Run]) -> Sifted:
     """Keep the runs whose scenario is defined as here, or, if it is not the project's, as in most records.
 
+    A table whose runs are all of ARM processors, where worlds move otherwise, is compared with itself, too.
     A record is kept if it is older than definitions, or than the parts of `LATER` in which it would differ.
     """
-    kept, refused = _same_parts([run for run in runs if run.record.run.scenario not in pinned()], later=False)
+    elsewhere = {run.table for run in runs} - {run.table for run in runs if not _is_of_arm(run)}
+    free = [run for run in runs if run.record.run.scenario not in pinned() or run.table in elsewhere]
+    kept, refused = _same_parts(free, later=False)
     kept, others = _same_parts(kept, later=True)
-    here, changed = sift_by((run for run in runs if run.record.run.scenario in pinned()), _unlike_the_pin)
+    here, changed = sift_by((run for run in runs if run not in free), unlike_the_pin)
     return [*kept, *here], [*refused, *others, *changed]
 
 
-def _unlike_the_pin(run: Run) -> str:
-    """Return in which parts the definition of a run is not the pinned one, in a sentence."""
+def unlike_the_pin(run: Run) -> str:
+    """Return in which parts the definition of a run of the project's scenarios is not the pinned one."""
     scenario = run.record.run.scenario
-    other = other_parts(_definition(run), pinned()[scenario])
-    if not other:
+    other = other_parts(_definition(run), pinned().get(scenario, {}))
+    if scenario not in pinned() or not other:
         return ""
-    machine = machine_of(run.record.fingerprint)
-    where = f" Worlds may move otherwise on {machine}." if machine in ("aarch64", "arm64") else ""
+    where = f" Worlds may move otherwise on {machine_of(run.record.fingerprint)}." if _is_of_arm(run) else ""
     return f"it was made with another {scenario}: {', '.join(other)} differ.{where}"
+
+
+def _is_of_arm(run: Run) -> bool:
+    return machine_of(run.record.fingerprint) in ("aarch64", "arm64")
 
 
 def _same_parts(runs: list[Run], later: bool) -> Sifted:

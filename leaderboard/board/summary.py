@@ -95,6 +95,9 @@ class Summary:
     """Rows by scenario and division, the best first; scenarios with a criterion come first."""
     starts: Mapping[str, float | None] = field(default_factory=dict)
     """Mean success of the pretrained policy on its skills, by scenario."""
+    machines: Mapping[str, str] = field(default_factory=dict)
+    """Kind of processor on which all records of a scenario were made, if its worlds move otherwise there than
+    in the published records, by scenario."""
     unpaired: Mapping[str, Mapping[str, Sequence[int]]] = field(default_factory=dict)
     """Seeds with which runs began with another pretrained policy than plain fine-tuning, by scenario and
     method."""
@@ -108,6 +111,7 @@ class Summary:
         return {
             "rows": [_row_to_json(row) for row in self.rows],
             "starts": dict(self.starts),
+            "machines": dict(self.machines),
             "unpaired": {name: dict(found) for name, found in self.unpaired.items()},
             "agreements": {name: found and asdict(found) for name, found in self.agreements.items()},
             "not_shown": [asdict(entry) for entry in self.not_shown],
@@ -123,6 +127,7 @@ class Summary:
         return Summary(
             rows=tuple(_row_from_json(row) for row in values["rows"]),
             starts=values["starts"],
+            machines=values["machines"],
             unpaired=values["unpaired"],
             agreements={name: found and Concordance(**found) for name, found in values["agreements"].items()},
             not_shown=tuple(NotShown(**entry) for entry in values["not_shown"]),

@@ -143,6 +143,16 @@ def start_text(rate: float | None) -> str:
     return sentence if rate >= WEAK else f"{sentence} {WEAK_WARNING}"
 
 
+def machine_text(machine: str | None) -> str:
+    """Return a sentence on a table that no other may be compared with; see `Summary.machines`."""
+    if not machine:
+        return ""
+    return (
+        f"All these records were made on {machine}, where worlds move otherwise than on x86-64: compare them "
+        "with one another, and not with the published board."
+    )
+
+
 def unpaired_text(found: Mapping[str, Sequence[int]] | None) -> str:
     """Return a sentence on methods whose runs did not begin like plain fine-tuning; empty if all did.
 

@@ -28,6 +28,7 @@ from .format import (
     aligned,
     column_title,
     fitting,
+    machine_text,
     number_text,
     scaled,
     start_text,
@@ -100,6 +101,7 @@ def terminal(table: Summary, width: int = 108, sort: str | None = None) -> Rende
         parts += _fitted(scenario, _sorted(rows, sort), _heads(rows, sort), width)
         sentences = (
             start_text(table.starts.get(scenario)),
+            machine_text(table.machines.get(scenario)),
             unpaired_text(table.unpaired.get(scenario)),
             agreement_text(table.agreements.get(scenario)),
         )

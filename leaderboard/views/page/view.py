@@ -29,7 +29,16 @@ from ...board.tiers import TIERS
 from ...policies.compared import Comparison, Comparisons
 from ...policies.decoders import Decoding, read_decoding
 from ..descriptions import RULES
-from ..format import Column, agreement_text, prediction_text, start_text, tiers_text, title_of, unpaired_text
+from ..format import (
+    Column,
+    agreement_text,
+    machine_text,
+    prediction_text,
+    start_text,
+    tiers_text,
+    title_of,
+    unpaired_text,
+)
 from .definitions import Family, families
 from .rows import RowView, columns, others, places, row_view
 from .stills import film, stills
@@ -60,6 +69,8 @@ class ScenarioView:
     """Gains over plain fine-tuning at settings that tuning rated as highly as the chosen one, by method."""
     start: str
     """Sentence on what the pretrained policy can do, empty if there is none."""
+    machine: str
+    """Sentence on a table of another kind of processor, whose worlds move otherwise; empty if there is none."""
     unpaired: str
     """Sentence on rows that began with another pretrained policy than sft, empty if none did."""
     agreement: str
@@ -234,6 +245,7 @@ def scenarios(tables: Mapping[str, list[Row]], board: Board, comparisons: Compar
                 frontier=board.frontiers.get(scenario, ()),
                 tied=board.tied.get(scenario, {}),
                 start=start_text(board.starts.get(scenario)),
+                machine=machine_text(board.machines.get(scenario)),
                 unpaired=unpaired_text(board.unpaired.get(scenario)),
                 agreement=agreement_text(board.agreements.get(scenario)),
                 comparisons=comparisons.get(scenario, ()),

@@ -27,7 +27,12 @@ def test_a_summary_is_the_same_after_json_and_what_one_seed_shows_stays_uncertai
         costs={"steps": 3.0},
         order_sensitivity=None,
     )
-    before = Summary(rows=(row,), starts={"clbench/Toy-v0": 1.0}, unpaired={"clbench/Toy-v0": {"sft": [3]}})
+    before = Summary(
+        rows=(row,),
+        starts={"clbench/Toy-v0": 1.0},
+        unpaired={"clbench/Toy-v0": {"sft": [3]}},
+        machines={"clbench/Toy-v0": "arm64"},
+    )
     after = Summary.from_json(json.loads(json.dumps(before.to_json())))
     assert after == before
     assert after.rows[0].estimates["gain"].is_above(0.0) == (len(seeds) > 1)

@@ -10,6 +10,7 @@ import pytest
 from clbench.base.entry_points import resolve
 
 agreement_text = resolve("clbench.leaderboard.views.format:agreement_text")
+machine_text = resolve("clbench.leaderboard.views.format:machine_text")
 unpaired_text = resolve("clbench.leaderboard.views.format:unpaired_text")
 Concordance = resolve("clbench.leaderboard.board.agreement:Concordance")
 tier_text = resolve("clbench.leaderboard.views.format:tier_text")
@@ -80,6 +81,11 @@ def test_only_an_agreement_beyond_chance_is_called_one() -> None:
         "It is not certain that the 12 seeds agree on the order of the 15 methods: Kendall's W 0.10, p = 0.2."
     )
     assert agreement_text(None) == ""
+
+
+def test_a_table_of_another_kind_of_processor_warns_of_the_published_one() -> None:
+    assert machine_text(None) == machine_text("") == ""
+    assert machine_text("aarch64").startswith("All these records were made on aarch64, where worlds move ")
 
 
 def test_runs_that_did_not_begin_like_plain_fine_tuning_are_named_with_a_way_out() -> None:

@@ -178,6 +178,28 @@ def test_a_record_of_another_definition_of_a_scenario_of_the_project_is_not_show
         assert "\x1b" not in text
 
 
+def test_records_that_are_all_of_arm_make_a_table_that_says_so(
+    add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+) -> None:
+    ours = pinned()["clbench/Fetch-v1"]
+
+    def on_arm(record: Record) -> None:
+        moved = "1" if record.run.seed == 2 else "0"
+        record.fingerprint |= {"definition": {**ours, "task press": moved}, "hardware": {"machine": "arm64"}}
+
+    for seed in range(3):
+        add_full(
+            "sft", seed, edit=on_arm, scenario="clbench/Fetch-v1", place=f"Fetch-v1/sft/seed-{seed}.json"
+        )
+    for text in shown():
+        assert "All these records were made on arm64, where worlds move otherwise than on x86-64" in flat(
+            text
+        )
+        reason = "its scenario is not that of most records: task press differ."
+        assert f"Fetch-v1/sft/seed-2.json: {reason}" in flat(text)
+        assert "Fetch-v1/sft/seed-1.json" not in flat(text)
+
+
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"a": 1}', '{"schema": 99}', "[" * 99_999, "\x00"])
 def test_a_file_that_is_no_record_is_listed_and_hides_no_other(
     content: str, four_methods: Path, shown: Callable[[], tuple[str, str]]
