@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import logging
+import os
+import re
 import socket
 import threading
 import time
 from contextlib import ExitStack, suppress
+from http import HTTPStatus
 from itertools import dropwhile, islice
 from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
-from websockets.exceptions import ConnectionClosed, InvalidHandshake
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from clbench.base.errors import InputError
 from clbench.base.text import printable, shortened
-from clbench.serving.server import LARGEST_MESSAGE, Observations, pack, unpack
+from clbench.serving.server import LARGEST_MESSAGE, TOKEN, Observations, bearer, pack, unpack
 
 LOG = logging.getLogger("clbench")
 
@@ -41,7 +44,8 @@ _LOST = (ConnectionClosed, InvalidHandshake, OSError)
 class ServedPolicy:
     """A policy that a server offers, as a function from observations to chunks of actions.
 
-    A request that is interrupted is sent again: its reply depends on nothing else.
+    A request that is interrupted is sent again: its reply depends on nothing else. The environment variable
+    CLBENCH_POLICY_TOKEN holds the token that a server asks for.
 
     Args:
         address: Address of the server, for example "ws://localhost:8000".
@@ -49,13 +53,16 @@ class ServedPolicy:
         patience: Seconds to wait for a server that cannot be reached; loading a large policy takes minutes.
 
     Raises:
-        InputError: The address is no address, no server answers in time, or it speaks another protocol.
+        InputError: The address is no address, no server answers in time, or it speaks another protocol, the
+            token is wrong or missing, or cannot be one.
     """
 
     def __init__(self, address: str, timeout: float = 300.0, patience: float = 600.0) -> None:
+        self.address, self._timeout, self._patience = _without_password(address), timeout, patience
+        """Address of the server, without user and password: messages show it."""
         if not _is_address(address):
-            raise InputError(f"The address of a policy is ws://host:port, not {address!r}.")
-        self.address, self._timeout, self._patience = address, timeout, patience
+            raise InputError(f"The address of a policy is ws://host:port, not {self.address!r}.")
+        self._full_address, self._headers = address, _headers(address)
         self._connection: ClientConnection | None = None
         self._opened = ExitStack()
         self._greeting: dict[Any, bytes] | None = None
@@ -117,7 +124,8 @@ class ServedPolicy:
         """Return a new connection whose server has sent its metadata."""
         try:
             opening = connect(
-                self.address,
+                self._full_address,
+                additional_headers=self._headers,
                 compression=None,
                 max_size=LARGEST_MESSAGE,
                 ping_interval=None,  # openpi's server answers none while its policy computes, or compiles
@@ -126,6 +134,13 @@ class ServedPolicy:
             )
         except AssertionError as error:  # of websockets, where the other side speaks first, as SSH does
             raise InvalidHandshake("it sent something before the handshake") from error
+        except InvalidStatus as error:
+            if error.response.status_code != HTTPStatus.UNAUTHORIZED:
+                raise
+            raise InputError(
+                f"The server at {self.address} refuses this client: set the environment variable {TOKEN} to "
+                "the token that its serve(token=...) was given."
+            ) from error
         with ExitStack() as opened:
             connection = opened.enter_context(opening)
             metadata = self._receive(connection)
@@ -216,9 +231,35 @@ class ServedPolicy:
 def _is_address(text: str) -> bool:
     try:
         parts = urlsplit(text)
-        return parts.scheme in ("ws", "wss") and bool(parts.hostname) and parts.port != 0
+        is_whole = (parts.username is None) == (parts.password is None)
+        return parts.scheme in ("ws", "wss") and bool(parts.hostname) and parts.port != 0 and is_whole
     except ValueError:  # the port is no number
         return False
+
+
+def _without_password(address: str) -> str:
+    """Return an address without user and password, also if it is damaged: a password may hold any sign."""
+    return re.sub(r"^(\w+://)?.*@", r"\1", address, flags=re.DOTALL)
+
+
+def _headers(address: str) -> dict[str, str]:
+    """Return the headers of a connection: the token of the environment, if there is one.
+
+    Raises:
+        InputError: A header cannot hold the token, or the address has a password for the same header.
+    """
+    token = os.environ.get(TOKEN)
+    if token is None:
+        return {}
+    if urlsplit(address).username is not None:
+        raise InputError(
+            f"The address of the policy has a password, and {TOKEN} is set: a server reads only one of them. "
+            "Remove one."
+        )
+    try:
+        return {"Authorization": bearer(token)}
+    except ValueError as error:
+        raise InputError(f"{TOKEN}: {error}") from error
 
 
 def _reason(error: BaseException) -> str:

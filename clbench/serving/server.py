@@ -23,10 +23,14 @@ The protocol is openpi's. The first message is the metadata of the server. Then 
 of observations, and each reply one with `actions`. All are msgpack, with arrays as in openpi's
 `msgpack_numpy`. An error is sent as text, and ends the connection. `GET /healthz` answers OK. Unlike openpi's
 own client, a client sends batches.
+
+With `serve(act, token=...)` a client must send that token, as `Authorization: Bearer TOKEN`. `clbench score`
+reads it from the environment variable CLBENCH_POLICY_TOKEN.
 """
 
 from __future__ import annotations
 
+import hmac
 import re
 import socket
 import sys
@@ -34,6 +38,7 @@ import threading
 import traceback
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any
 
@@ -56,6 +61,9 @@ Policy = Callable[[Observations], Any]
 
 _WILDCARDS = ("", "0.0.0.0", "::")
 """Hosts that stand for all addresses of this machine."""
+
+TOKEN = "CLBENCH_POLICY_TOKEN"
+"""Environment variable in which `clbench score` looks for the token of a server."""
 
 LARGEST_MESSAGE = 256 * 2**20
 """Bytes of the largest request that is read: 40 episodes with pictures of 1,400 x 1,400 pixels."""
@@ -167,7 +175,11 @@ def openpi_policy(
 
 
 def serve(
-    policy: Policy, host: str = "localhost", port: int = 8000, metadata: Mapping[str, Any] | None = None
+    policy: Policy,
+    host: str = "localhost",
+    port: int = 8000,
+    metadata: Mapping[str, Any] | None = None,
+    token: str | None = None,
 ) -> None:
     """Serve a policy until the program is interrupted.
 
@@ -179,12 +191,14 @@ def serve(
         host: Address to listen on. "0.0.0.0" lets any machine that reaches this one use the policy.
         port: Port to listen on; 0 lets the system choose one, which is printed.
         metadata: What clients receive first, texts and numbers, for example the name of a checkpoint.
+        token: Secret that a client must send; None serves every client.
 
     Raises:
+        ValueError: The token is empty, or has spaces or other characters than those of ASCII.
         SystemExit: The address cannot be listened on, for example because another program does.
     """
     try:
-        server = open_server(policy, host, port, metadata)
+        server = open_server(policy, host, port, metadata, token)
     except OSError as error:
         raise SystemExit(f"Cannot listen on {host or 'any address'}, port {port}: {error}.") from error
     with server:
@@ -196,12 +210,17 @@ def serve(
 
 
 def open_server(
-    policy: Policy, host: str = "localhost", port: int = 8000, metadata: Mapping[str, Any] | None = None
+    policy: Policy,
+    host: str = "localhost",
+    port: int = 8000,
+    metadata: Mapping[str, Any] | None = None,
+    token: str | None = None,
 ) -> Server:
     """Return a server that listens, for a thread of your own: it has `serve_forever` and `shutdown`.
 
     The arguments are those of `serve`.
     """
+    expected = None if token is None else bearer(token)
     greeting, lock = pack(dict(metadata or {})), threading.Lock()
 
     def handle(connection: ServerConnection) -> None:
@@ -227,7 +246,7 @@ def open_server(
         compression=None,
         max_size=LARGEST_MESSAGE,
         origins=[None],  # a page in a browser reaches localhost, too; browsers name its origin
-        process_request=_answer_health_check,
+        process_request=partial(_answer_without_policy, expected),
     )
 
 
@@ -252,8 +271,30 @@ def _answer(policy: Policy, message: str | bytes) -> bytes:
     return pack({"actions": numbers})
 
 
-def _answer_health_check(connection: ServerConnection, request: Request) -> Response | None:
-    return connection.respond(HTTPStatus.OK, "OK\n") if request.path == "/healthz" else None
+def _answer_without_policy(
+    expected: str | None, connection: ServerConnection, request: Request
+) -> Response | None:
+    """Answer a health check, and refuse a client without the token."""
+    if request.path == "/healthz":
+        return connection.respond(HTTPStatus.OK, "OK\n")
+    # as bytes: a header may hold characters that compare_digest refuses in a text
+    given = "".join(request.headers.get_all("Authorization")).encode(errors="surrogateescape")
+    if expected is None or hmac.compare_digest(given, expected.encode()):
+        return None
+    refusal = connection.respond(HTTPStatus.UNAUTHORIZED, f"This policy needs a token: set {TOKEN}.\n")
+    refusal.headers["WWW-Authenticate"] = "Bearer"
+    return refusal
+
+
+def bearer(token: str) -> str:
+    """Return the value of the header that carries a token.
+
+    Raises:
+        ValueError: The token is empty, or has characters that a header cannot hold.
+    """
+    if not re.fullmatch("[!-~]+", token):  # the message does not tell the secret
+        raise ValueError("A token must be printable ASCII characters without spaces, at least one.")
+    return f"Bearer {token}"
 
 
 # ---- messages ----------------------------------------------------------------------------------------------

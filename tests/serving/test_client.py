@@ -18,7 +18,7 @@ from websockets.sync.server import ServerConnection, serve
 
 from clbench.base.errors import InputError
 from clbench.serving.client import ServedPolicy
-from clbench.serving.server import pack
+from clbench.serving.server import open_server, pack
 
 OBSERVATIONS = {
     "state": np.zeros((2, 4), np.float32),
@@ -126,6 +126,84 @@ def test_a_server_that_is_still_loading_is_waited_for_with_a_message_now_and_the
     found[0].close()
 
 
+@contextmanager
+def guarded(**options: Any) -> Iterator[str]:
+    """Serve a policy that repeats states, and yield the address without its scheme."""
+    with open_server(lambda seen: seen["state"][:, None], port=0, **options) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield f"localhost:{server.socket.getsockname()[1]}"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def test_the_token_of_the_environment_opens_a_server_that_asks_for_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("CLBENCH_POLICY_TOKEN", "secret")
+    with guarded(token="secret") as place:
+        served = ServedPolicy(f"ws://{place}")
+        assert served(OBSERVATIONS).shape == (2, 1, 4)
+        served.close()
+    with guarded() as place:  # which asks for none
+        ServedPolicy(f"ws://{place}").close()
+
+
+@pytest.mark.parametrize("token", [None, "wrong"])
+def test_a_client_without_the_right_token_is_told_at_once_what_to_set(
+    token: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("CLBENCH_POLICY_TOKEN", raising=False)
+    if token is not None:
+        monkeypatch.setenv("CLBENCH_POLICY_TOKEN", token)
+    message = r"set the environment variable CLBENCH_POLICY_TOKEN to the token that its serve\(token=\.\.\.\)"
+    with guarded(token="secret") as place, pytest.raises(InputError, match=message) as caught:
+        ServedPolicy(f"ws://{place}")
+    assert "wrong" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("address", "token", "message"),
+    [
+        ("ws://localhost:1", "two words", "CLBENCH_POLICY_TOKEN: A token must be printable ASCII"),
+        ("ws://localhost:1", "", "CLBENCH_POLICY_TOKEN: A token must be printable ASCII"),
+        ("ws://user:words@localhost:1", "secret", "has a password, and CLBENCH_POLICY_TOKEN is set"),
+    ],
+)
+def test_a_token_that_cannot_be_sent_is_refused_and_not_shown(
+    address: str, token: str, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CLBENCH_POLICY_TOKEN", token)
+    with pytest.raises(InputError, match=message) as caught:
+        ServedPolicy(address)
+    assert "secret" not in str(caught.value)
+    assert "words" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("address", "shown"),
+    [
+        ("ws://user:sekret@localhost:1", "ws://localhost:1"),
+        ("ws://user:sek@ret@localhost:1/path", "ws://localhost:1/path"),
+        ("ws://user:sek/ret@localhost:1", "ws://localhost:1"),
+        ("ws://sekret@localhost:1", "ws://localhost:1"),
+        ("user:sekret@localhost:1", "localhost:1"),
+        ("http://user:sekret@localhost:1", "http://localhost:1"),
+    ],
+)
+def test_no_message_shows_the_password_of_an_address(
+    address: str, shown: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("CLBENCH_POLICY_TOKEN", raising=False)
+    with pytest.raises(InputError) as caught:
+        ServedPolicy(address, patience=0.3)
+    told = str(caught.value) + caplog.text
+    assert shown in told
+    assert not any(secret in told for secret in ("user:", "sek", "ret@"))
+
+
 @pytest.mark.parametrize("address", ["localhost:8000", "http://localhost", "ws://", "ws://host:port"])
 def test_another_address_is_refused(address: str) -> None:
     with pytest.raises(InputError, match=r"The address of a policy is ws://host:port, not "):
@@ -184,10 +262,7 @@ def ending(connection: ServerConnection) -> None:
         (sending(f"{TRACEBACK}{'x' * 10**6}"), r"failed: x{500} \[\.\.\. the output of the server has"),
         (sending(f"{TRACEBACK}{FRAME * 3000}KeyError: 1\n"), r"failed: KeyError: 1$"),
         (sending(b"\xc1"), "does not speak openpi's protocol"),
-        (
-            silent,
-            r"did not answer within 0\.2 seconds: a slower one needs a larger --timeout, and .* other clients",
-        ),
+        (silent, r"did not answer within 0\.2 seconds: a slower one needs a larger --timeout, .*clients"),
         (ending, "ended the connection 5 times during one request"),
     ],
 )

@@ -184,6 +184,32 @@ def test_a_request_whose_client_has_gone_while_it_waited_is_not_computed() -> No
     assert calls == [1, 3]
 
 
+@pytest.mark.parametrize("sent", [None, "", "Bearer", "Bearer no", "secret", "Basic secret", "Bearer sécret"])
+def test_a_server_with_a_token_refuses_clients_without_it(sent: str | None) -> None:
+    headers = {} if sent is None else {"Authorization": sent}
+    with open_server(twice, port=0, token="secret") as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        port = server.socket.getsockname()[1]
+        with pytest.raises(InvalidStatus, match="HTTP 401") as caught:
+            connect(f"ws://localhost:{port}", proxy=None, additional_headers=headers)
+        assert caught.value.response.body == b"This policy needs a token: set CLBENCH_POLICY_TOKEN.\n"
+        with urllib.request.urlopen(f"http://localhost:{port}/healthz") as answer:
+            assert answer.read() == b"OK\n"
+        right = {"Authorization": "Bearer secret"}
+        with connect(f"ws://localhost:{port}", proxy=None, additional_headers=right) as connection:
+            assert received(connection) == {}
+        server.shutdown()
+        thread.join()
+
+
+@pytest.mark.parametrize("token", ["", "two words", "secret\n", "sécret"])
+def test_a_token_that_no_header_can_hold_is_refused_and_not_shown(token: str) -> None:
+    with pytest.raises(ValueError, match="printable ASCII characters without spaces") as caught:
+        open_server(twice, port=0, token=token)
+    assert not token or token not in str(caught.value)
+
+
 def test_a_page_in_a_browser_cannot_use_a_policy() -> None:
     with connected(twice) as (connection, port):
         with pytest.raises(InvalidStatus, match="HTTP 403"):
