@@ -56,7 +56,7 @@ def forecast(plan: Plan, runs: Sequence[ResolvedRun], workers: int, checkpoints:
     return [
         f"To do: {to_do}.",
         _time(plan.jobs, list(scenarios.values()), workers),
-        _disk(plan.jobs, runs, scenarios, checkpoints),
+        _disk(plan.jobs, runs, scenarios, workers, checkpoints),
     ]
 
 
@@ -87,13 +87,20 @@ def _disk(
     jobs: Sequence[Job],
     runs: Sequence[ResolvedRun],
     scenarios: Mapping[str, Scenario],
+    at_once: int,
     checkpoints: Path | None,
 ) -> str:
     policies = {name: _policy_bytes(scenario) for name, scenario in scenarios.items()}
     made = sum(map(_data_bytes, scenarios.values()))
     made += sum(policies[job.arguments["scenario"]] for job in jobs if job.function is work.pretrain)
     records = RECORD_BYTES * sum(job.function is work.do_run for job in jobs)
-    parts = [f"about {_megabytes(made)} in the caches", f"{_megabytes(records)} of records"]
+    # a checkpoint is written before the one of the stage before goes, and a method's state is not in it
+    meanwhile = 2 * min(at_once, len(runs)) * max(policies.values())
+    parts = [
+        f"about {_megabytes(made)} in the caches",
+        f"{_megabytes(meanwhile)} more while runs go on",
+        f"{_megabytes(records)} of records",
+    ]
     if checkpoints:
         kept = sum(policies[run.spec.scenario] * (len(run.scenario.target) + 1) for run in runs)
         parts.append(f"{_megabytes(kept)} of policies in {checkpoints}")

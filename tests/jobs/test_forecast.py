@@ -88,9 +88,12 @@ def test_the_disk_is_that_of_policies_demonstrations_and_records(monkeypatch: py
     to_do, _, disk = forecast(_plan(*jobs), RUNS, 1, Path("kept"))
     assert to_do == "To do: 2 policies to pretrain, 3 runs."
     made, kept = 2 * bytes_of_policy + demonstrations, 2 * 3 * bytes_of_policy  # after 0, 1 and 2 targets
-    words = [f"{count / 1e3:.0f} kB" if count < 1e6 else f"{count / 1e6:.0f} MB" for count in (made, kept)]
+    meanwhile = 2 * bytes_of_policy  # the checkpoint of a stage, and for a moment the one before
+    sizes = (made, meanwhile, kept)
+    words = [f"{count / 1e3:.0f} kB" if count < 1e6 else f"{count / 1e6:.0f} MB" for count in sizes]
     assert disk == (
-        f"Disk: about {words[0]} in the caches, 300 kB of records, {words[1]} of policies in kept."
+        f"Disk: about {words[0]} in the caches, {words[1]} more while runs go on, 300 kB of records, "
+        f"{words[2]} of policies in kept."
     )
 
 
