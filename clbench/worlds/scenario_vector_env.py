@@ -125,7 +125,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         ScenarioVectorEnv.__init__(self, *state["arguments"])
         self.spec = state["spec"]
 
-    @property
+    @property  # type: ignore[misc]  # SyncVectorEnv has no setter either
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
         """The generators of the environments, as `SyncVectorEnv` has them."""
         return tuple(generator for generator, _ in self._generators)
@@ -226,7 +226,8 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
 
     def _finished(self, numbers: list[int], successes: Flags) -> dict[str, Any]:
         """Begin the next episodes of the environments `numbers`, and return what the last ones ended with."""
-        shown, info = self._observation(numbers), {}
+        shown = self._observation(numbers)
+        info: dict[str, Any] = {}
         for row, number in enumerate(numbers):
             told = self._starts[number].info(bool(successes[number]))
             last = {name: values[row] for name, values in shown.items()}

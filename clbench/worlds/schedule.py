@@ -5,7 +5,7 @@ from __future__ import annotations
 import string
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 from gymnasium import spaces
@@ -30,7 +30,7 @@ class InstructionSpace(spaces.Text):
 
 
 @create_shared_memory.register
-def _refuse_shared_memory(space: InstructionSpace, n: int = 1, ctx: Any = None) -> None:
+def _refuse_shared_memory(space: InstructionSpace, n: int = 1, ctx: Any = None) -> NoReturn:
     raise CustomSpaceError(
         "Gymnasium cannot show instructions as text from shared memory. Give AsyncVectorEnv "
         'shared_memory=False (make_vec: vector_kwargs={"shared_memory": False}), or give the environment '

@@ -135,7 +135,8 @@ def test_steps_of_all_environments_add_up_without_those_that_only_begin_an_episo
 @pytest.mark.parametrize("seed", [None, 5, [7, None], [None, 8]])
 def test_generators_and_their_seeds_are_those_of_gymnasiums_own(seed: Any) -> None:
     found = []
-    for env in (_toy(), gymnasium.make_vec(TOY, num_envs=2, vectorization_mode="sync")):
+    envs: list[Any] = [_toy(), gymnasium.make_vec(TOY, num_envs=2, vectorization_mode="sync")]
+    for env in envs:
         env.reset(seed=[3, 4])
         env.reset(seed=seed)
         states = [generator.bit_generator.state for generator in env.np_random]
