@@ -173,7 +173,9 @@ LONG_ANSWER = (dataclasses.replace(TOY_QUESTIONS[0], answers=("left", "to the ri
 STRANGE_WORD = (dataclasses.replace(TOY_QUESTIONS[0], wordings=("где is it",)),)
 THIRD_ANSWER = (dataclasses.replace(TOY_QUESTIONS[0], answers=("left", "right", "up")),)
 TOO_HIGH = (dataclasses.replace(TOY_QUESTIONS[0], answer=lambda states: np.full(len(states), 2)),)
-BROKEN = (dataclasses.replace(TOY_QUESTIONS[0], answer=lambda states: np.full(len(states), [0, 1][len(states)])),)
+BROKEN = (
+    dataclasses.replace(TOY_QUESTIONS[0], answer=lambda states: np.full(len(states), [0, 1][len(states)])),
+)
 FLOATS = (dataclasses.replace(TOY_QUESTIONS[0], answer=fractions),)
 
 

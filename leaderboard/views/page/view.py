@@ -70,7 +70,7 @@ class ScenarioView:
     start: str
     """Sentence on what the pretrained policy can do, empty if there is none."""
     machine: str
-    """Sentence on a table of another kind of processor, whose worlds move otherwise; empty if there is none."""
+    """Sentence on a table that was made on another kind of processor, empty if there is none."""
     unpaired: str
     """Sentence on rows that began with another pretrained policy than sft, empty if none did."""
     agreement: str
