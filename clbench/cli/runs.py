@@ -152,6 +152,8 @@ def score(
     executed: Annotated[int | None, whole_number(1)] = None,
     data: str | None = None,
     steps: Annotated[int | None, whole_number(0)] = None,
+    pictures: str | None = None,
+    picture_size: Annotated[int, whole_number(1)] = 224,
     timeout: Annotated[int, whole_number(1)] = 300,
     restart: Annotated[bool, Parameter(negative="")] = False,
     records: Path = RECORDS,
@@ -173,6 +175,9 @@ def score(
             number is the same in all stages.
         data: What the policy was trained on in this stage, in words. The record keeps it.
         steps: Optimiser steps of the stage. The record keeps them.
+        pictures: Cameras of the simulator whose pictures the policy gets, separated by commas, for example
+            agentview,robot0_eye_in_hand. They are the same in all stages.
+        picture_size: Height and width of these pictures in pixels.
         timeout: Time limit of a reply in seconds; the first reply may include compilation.
         restart: Score a finished stage again. This drops the stage and all later ones, but never a finished
             record.
@@ -197,6 +202,8 @@ def score(
         "executed": executed,
         "data": data,
         "steps": steps,
+        "pictures": [] if pictures is None else items_of("--pictures", pictures),
+        "picture_size": picture_size,
         "restart": restart,
         "records": records,
     }

@@ -25,6 +25,7 @@ from clbench.base.errors import InputError, WrongTypeError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import derive_seed
 from clbench.evaluation.episodes import LANES, Episode, Live, Trial, play_in_lanes
+from clbench.evaluation.views import Views
 from clbench.spec.protocol import EpisodeKey
 from clbench.spec.scenario import Scenario
 from clbench.worlds.lanes import Lanes
@@ -204,12 +205,14 @@ def play_chunks(
     executed: int | None = None,
     whole: bool = True,
     progress: ProgressCallback = no_progress,
+    views: Views | None = None,
 ) -> ChunkPlay:
     """Return the outcome of each of `trials`.
 
     The policy observes `state`, float32 (LANES, S), `image`, uint8 (LANES, N, N, 3), where the tasks have a
     camera, `instruction`, texts, and what noise may be drawn from: `seed`, int64 (LANES,), different for each
-    episode, and `step`, int64 (LANES,), the steps taken in it. Unused rows repeat the first one.
+    episode, and `step`, int64 (LANES,), the steps taken in it. With `views` it also observes
+    `pictures/<camera>`, uint8 (LANES, N, N, 3), of each camera. Unused rows repeat the first one.
 
     Args:
         policy: Policy that acts.
@@ -220,11 +223,14 @@ def play_chunks(
             the first chunk.
         whole: Whether all chunks must have exactly that length, or may be longer.
         progress: Called with the number of episodes that have ended since its last call.
+        views: Cameras of the simulator whose pictures the policy observes; None gives none.
 
     Raises:
-        InputError: The actions have the wrong shape, or a chunk has another length.
+        UnknownNameError: A scene has no such camera.
+        InputError: The actions have the wrong shape, a chunk has another length, or nothing can be drawn.
+        RenderingError: This machine cannot draw.
     """
-    player = _ChunkPlayer(policy, executed, whole)
+    player = _ChunkPlayer(policy, executed, whole, views)
     episodes = _play(player.act, scenario, trials, seed, "text", LANES, progress)
     assert player.executed is not None
     return ChunkPlay(episodes, player.executed, *player.shares(episodes))
@@ -284,6 +290,7 @@ class _ChunkPlayer:
     policy: ChunkPolicy
     executed: int | None
     whole: bool
+    views: Views | None = None
     faults: dict[EpisodeKey, list[NDArray[np.bool_]]] = field(default_factory=dict)
     """For each episode, chunk after chunk, whether an action was not finite or was clipped, (H, 2)."""
 
@@ -291,7 +298,7 @@ class _ChunkPlayer:
         """Return the actions (lanes, H, A) to execute."""
         rows = list(_observations(lanes, live))
         rows = [
-            {**row, "seed": derive_seed("noise", one.seed), "step": one.length}
+            {**row, **self._pictures(lanes, one), "seed": derive_seed("noise", one.seed), "step": one.length}
             for row, one in zip(rows, live, strict=True)
         ]
         rows += [rows[0]] * (LANES - len(rows))
@@ -306,6 +313,11 @@ class _ChunkPlayer:
         for one, found in zip(live, np.stack([~finite, outside], axis=-1), strict=True):
             self.faults.setdefault(one.trial.key, []).append(found)
         return _within(actions, space)
+
+    def _pictures(self, lanes: Lanes, one: Live) -> dict[str, NDArray[np.uint8]]:
+        """Return the pictures of an episode, by their names in observations."""
+        drawn = {} if self.views is None else self.views.draw(lanes, one.lane, one.trial.task)
+        return {f"pictures/{name}": picture for name, picture in drawn.items()}
 
     def _length(self, chunks: Any) -> int:
         """Return the length of chunks, and remember that of the first ones.

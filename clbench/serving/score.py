@@ -9,7 +9,7 @@ import contextlib
 import logging
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import seeded
 from clbench.base.text import printable
 from clbench.evaluation.players import ChunkPlay, ChunkPolicy, play_chunks
+from clbench.evaluation.views import SIZE, Views
 from clbench.records.paths import RECORDS
 from clbench.records.reader import RecordError, read_record
 from clbench.records.record import EXTERNAL_USES, Record
@@ -45,6 +46,8 @@ def is_scored(
     executed: int | None = None,
     data: str | None = None,
     steps: int | None = None,
+    pictures: Sequence[str] = (),
+    picture_size: int = SIZE,
     restart: bool = False,
     records: Path | str = RECORDS,
 ) -> bool:
@@ -52,7 +55,7 @@ def is_scored(
 
     Raises:
         InputError: An earlier stage comes first, there is no such stage, the stage was scored with other
-            `executed`, `data` or `steps`, or `score` would refuse it for another reason.
+            `executed`, `data`, `steps` or `pictures`, or `score` would refuse it for another reason.
     """
     run = StagedRun(load_scenario(scenario), method, seed, Path(records), EXTERNAL_USES)
     if restart:
@@ -61,7 +64,8 @@ def is_scored(
     if restart or record is None or stage == run.next_after(record):
         return False
     kept = {**record.run.settings, **record.diagnostics.get(str(stage), {})}
-    for name, value in {"executed": executed, "data": data, "steps": steps}.items():
+    settings = {"executed": executed, "data": data, "steps": steps, **Views(pictures, picture_size).settings}
+    for name, value in settings.items():
         if value is not None and kept.get(name) != value:
             hint = (
                 "Its record is finished, and never edited"
@@ -84,6 +88,8 @@ def score(
     executed: int | None = None,
     data: str | None = None,
     steps: int | None = None,
+    pictures: Sequence[str] = (),
+    picture_size: int = SIZE,
     restart: bool = False,
     records: Path | str = RECORDS,
     progress: ProgressCallback = no_progress,
@@ -106,6 +112,8 @@ def score(
             stages. If None, all: chunks must then have one length in all stages.
         data: What the policy was trained on in this stage, in words.
         steps: Optimiser steps of the stage.
+        pictures: Cameras of the simulator whose pictures the policy gets, the same in all stages.
+        picture_size: Height and width of these pictures in pixels.
         restart: Score the stage although it was scored: it is dropped, and later ones with it.
         records: Folder of the records.
         progress: Called with the share of the stage's episodes that have ended since its last call.
@@ -115,8 +123,10 @@ def score(
 
     Raises:
         InputError: Another stage comes next, a record exists already, `executed` is not that of stage 0, the
-            earlier stages had another version of the scenario or its simulator, the actions have the wrong
-            shape, or a name or number is invalid.
+            earlier stages had another version of the scenario or its simulator, or other pictures, the
+            actions have the wrong shape, or a name or number is invalid.
+        UnknownNameError: A scene has no such camera.
+        RenderingError: This machine cannot draw the pictures.
         WrongTypeError: `data` is no text.
     """
     executed, steps = whole_number("executed", executed, 1), whole_number("steps", steps, 0)
@@ -125,12 +135,13 @@ def score(
         raise WrongTypeError(f"data must be words, not {data!r}.")
     run = StagedRun(load_scenario(scenario), method, seed, Path(records), EXTERNAL_USES)
     begin = time.perf_counter()
-    record = run.begin(stage, None if executed is None else {"executed": executed}, policy, restart)
+    views = Views(pictures, picture_size)
+    record = run.begin(stage, _settings(run, stage, restart, executed, views), policy, restart)
     server = _kept_metadata(getattr(policy, "metadata", {}))
     if server:
         _warn_if_known(server, record, run, stage)
     trials = run.trials(stage)
-    with seeded("external evaluation", seed, stage):
+    with seeded("external evaluation", seed, stage), contextlib.closing(views):
         played = play_chunks(
             policy,
             run.scenario,
@@ -139,11 +150,12 @@ def score(
             record.run.settings.get("executed"),
             whole=executed is None,
             progress=lambda count: progress(count / len(trials)),
+            views=views if views.cameras else None,
         )
     _warn(stage, played)
     run.report(record, stage, played.episodes)
     _warn_if_unchanged(record, stage)
-    record.run.settings = {"executed": played.executed}
+    record.run.settings = {"executed": played.executed, **views.settings}
     declared = {"data": data, "steps": steps, "server": server or None}
     record.diagnostics[str(stage)] = {
         **{name: value for name, value in declared.items() if value is not None},
@@ -153,6 +165,16 @@ def score(
     run.time(record, None, time.perf_counter() - begin)
     run.keep(record, stage)
     return record
+
+
+def _settings(
+    run: StagedRun, stage: int, restart: bool, executed: int | None, views: Views
+) -> dict[str, Any] | None:
+    """Return the settings of a stage: pictures are those of this call, `executed` may be that of stage 0."""
+    before = run.plan(stage, restart) if stage else None
+    known = before.run.settings.get("executed") if before else None
+    chosen = {"executed": known if executed is None else executed, **views.settings}
+    return {name: value for name, value in chosen.items() if value is not None} or None
 
 
 def _warn_if_known(server: Mapping[str, Any], record: Record, run: StagedRun, stage: int) -> None:

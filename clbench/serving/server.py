@@ -11,6 +11,7 @@ of each episode. Its observations are a dictionary:
 
 - `state`: float32 (B, S), the numbers that the scenario's policies may see;
 - `image`: uint8 (B, N, N, 3), only where the task has a camera;
+- `pictures/<camera>`: uint8 (B, N, N, 3), upright, for each camera of `clbench score --pictures`;
 - `instruction`: B texts;
 - `seed`: int64 (B,), a seed for each episode, and `step`: int64 (B,), the steps taken in it. Draw noise from
   both alone, and the outcomes repeat themselves.
@@ -85,8 +86,9 @@ def lerobot_policy(
     """Return a policy of LeRobot as a function of observations.
 
     The batch that `preprocess` receives has `observation.state`, float32 (B, S), `task`, a list of B texts,
-    and with a camera `observation.images.<camera>`, float32 (B, 3, N, N) from 0 to 1. Without a camera it has
-    the state as `observation.environment_state`, too: ACT refuses to go without both. `postprocess` receives
+    and with a camera `observation.images.<camera>`, float32 (B, 3, N, N) from 0 to 1, as for each camera of
+    `clbench score --pictures`. Without a camera it has the state as `observation.environment_state`, too: ACT
+    refuses to go without both. `postprocess` receives
     the actions (B, A) of one step after another, as in LeRobot's own server. Without `noise`, a policy draws
     from PyTorch's generator, which is seeded before each call by all seeds and steps together: the same
     request has the same reply, but the noise of an episode depends on the other ones in its request.
@@ -105,10 +107,13 @@ def lerobot_policy(
     def act(observations: Observations) -> NDArray[Any]:
         state = torch.from_numpy(observations["state"])
         batch = {"observation.state": state, "task": list(observations["instruction"])}
+        seen = _pictures(observations)
         if "image" in observations:
-            pictures = torch.from_numpy(observations["image"]).permute(0, 3, 1, 2)
-            batch[f"observation.images.{camera}"] = pictures.contiguous().float() / 255
-        else:
+            seen[camera] = observations["image"]
+        for name, pictures in seen.items():
+            colours_first = torch.from_numpy(pictures).permute(0, 3, 1, 2).contiguous()
+            batch[f"observation.images.{name}"] = colours_first.float() / 255
+        if not seen:
             batch["observation.environment_state"] = state
         torch.manual_seed(int(observations["seed"].sum() + observations["step"].sum()))
         drawn = {}
@@ -132,10 +137,17 @@ def _noise(seed: Any, step: Any, shape: tuple[int, int]) -> NDArray[np.float32]:
     return np.random.default_rng([int(seed), int(step)]).standard_normal(shape, np.float32)
 
 
+def _pictures(observations: Observations) -> dict[str, Any]:
+    """Return the pictures of `clbench score --pictures` by camera."""
+    names = [name for name in observations if name.startswith("pictures/")]
+    return {name.partition("/")[2]: observations[name] for name in names}
+
+
 def _openpi_observation(row: Observations) -> Observations:
     """Return one observation with names as in openpi's examples."""
     image = {"observation/image": row["image"]} if "image" in row else {}
-    return {"observation/state": row["state"], **image, "prompt": row["instruction"]}
+    pictures = {f"observation/{name}": picture for name, picture in _pictures(row).items()}
+    return {"observation/state": row["state"], **image, **pictures, "prompt": row["instruction"]}
 
 
 def openpi_policy(
@@ -145,13 +157,15 @@ def openpi_policy(
 ) -> Policy:
     """Return a policy that takes one observation at a time, such as openpi's, as a function of observations.
 
-    Nothing of openpi is needed. There is one camera at most, and the state is that of the scenario. The
-    policy's input transform must not ask for more: openpi's `LiberoInputs` does, for a picture of the wrist.
+    Nothing of openpi is needed. The state is that of the scenario, and the policy's input transform must not
+    ask for more than it gets: openpi's `LiberoInputs` also wants a picture of the wrist, which `clbench score
+    --pictures` gives under the camera's name.
 
     Args:
         policy: A policy whose `infer(observation)` returns a dictionary with `actions`, (H, A).
         observation: Function from one row of the observations to what the policy expects. By default
-            `observation/state`, `prompt`, and with a camera `observation/image`.
+            `observation/state`, `prompt`, with a camera `observation/image`, and `observation/<camera>` for
+            each camera of `--pictures`.
         noise: Shape of the noise that `infer(observation, noise=...)` starts from: the horizon and the size
             of an action inside the model. It is drawn from seed and step, so that outcomes repeat themselves.
             None lets the policy draw its own.

@@ -413,6 +413,21 @@ def test_a_policy_of_openpi_infers_one_episode_after_another() -> None:
     assert np.array_equal(second["observation/image"], OBSERVATIONS["image"][1])
 
 
+def test_pictures_of_cameras_reach_policies_under_the_names_of_their_cameras() -> None:
+    wrist = 7 * np.ones((2, 4, 4, 3), np.uint8)
+    observations = {**OBSERVATIONS, "pictures/wrist": wrist}
+    shaped = LeRobotShaped()
+    lerobot_policy(shaped, shaped.preprocess, shaped.postprocess)(observations)
+    (batch,) = shaped.batches
+    assert np.allclose(batch["observation.images.wrist"].numpy(), 7 / 255)
+    assert "observation.images.image" in batch
+    policy = OpenpiShaped()
+    openpi_policy(policy)(observations)
+    (shown, _), *_ = policy.seen
+    assert np.array_equal(shown["observation/wrist"], wrist[0])
+    assert "observation/image" in shown
+
+
 def test_a_policy_of_openpi_may_have_other_names_and_noise_that_repeats_itself() -> None:
     policy = OpenpiShaped()
     act = openpi_policy(policy, lambda row: {"joints": row["state"]}, noise=(4, 8))

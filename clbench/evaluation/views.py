@@ -1,0 +1,103 @@
+"""Pictures of running episodes from a simulator's own cameras, for a policy that sees what a robot sees.
+
+They are for policies of other programs. Those of clbench see a task's `Camera`, which is drawn from the state
+alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clbench.base.entry_points import unknown
+from clbench.base.errors import InputError
+from clbench.spec.fields import whole_number
+from clbench.spec.task import Task
+from clbench.worlds.gl_backend import RenderingError, draw_without_display
+from clbench.worlds.lanes import Lanes
+
+if TYPE_CHECKING:
+    import mujoco
+
+SIZE = 224
+"""Usual height and width of a picture, which OpenVLA and openpi read."""
+
+
+class Views:
+    """Cameras of simulators, and the size of their pictures.
+
+    A renderer belongs to one compiled scene and takes seconds to make: it stays for all episodes of a scene.
+
+    Args:
+        cameras: Names of cameras that the scenes of all tasks have.
+        size: Height and width N of a picture in pixels.
+
+    Raises:
+        InputError: A name is there twice or no text, or the size is no whole number from 1.
+    """
+
+    def __init__(self, cameras: Sequence[str], size: int = SIZE) -> None:
+        if len({*cameras}) < len(cameras) or not all(isinstance(name, str) for name in cameras):
+            raise InputError(f"Pictures are of different cameras, each named once, not {cameras!r}.")
+        self.cameras, self.size = tuple(cameras), int(whole_number("picture_size", size, 1) or SIZE)
+        self._renderers: dict[int, tuple[mujoco.MjModel, mujoco.Renderer]] = {}
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the record of a run keeps, empty without a camera."""
+        return {"pictures": list(self.cameras), "picture_size": self.size} if self.cameras else {}
+
+    def draw(self, lanes: Lanes, lane: int, task: Task) -> dict[str, NDArray[np.uint8]]:
+        """Return the pictures (N, N, 3) of one lane, upright, by camera.
+
+        Raises:
+            UnknownNameError: The scene has no such camera.
+            InputError: The world has no scene to draw, or the scene draws no picture of this size.
+            RenderingError: This machine cannot draw.
+        """
+        drawable = getattr(lanes.world(task), "drawable", None)
+        if drawable is None:
+            raise InputError(
+                f"The task {task.name!r} has no pictures: the vector world of {task.world} has no drawable()."
+            )
+        model, data, _ = drawable(lane)
+        renderer, pictures = self._renderer(model), {}
+        for name in self.cameras:
+            renderer.update_scene(data, camera=name)
+            pictures[name] = renderer.render().copy()
+        return pictures
+
+    def _renderer(self, model: mujoco.MjModel) -> mujoco.Renderer:
+        """Return the renderer of a scene, which is made on first use."""
+        if id(model) not in self._renderers:
+            self._check(model)
+            draw_without_display()
+            import mujoco
+
+            try:
+                renderer = mujoco.Renderer(model, self.size, self.size)
+            except Exception as error:  # a back end raises errors of its own
+                raise RenderingError(
+                    f"This machine cannot draw ({error}): `clbench doctor` says what is missing."
+                ) from error
+            self._renderers[id(model)] = model, renderer  # a scene that is kept keeps its id
+        return self._renderers[id(model)][1]
+
+    def _check(self, model: mujoco.MjModel) -> None:
+        """Refuse cameras that a scene does not have, and a size that it cannot draw."""
+        known = [model.camera(number).name for number in range(model.ncam)]
+        for name in self.cameras:
+            if name not in known:
+                raise unknown("camera of the scene", name, known)
+        most = min(model.vis.global_.offwidth, model.vis.global_.offheight)
+        if self.size > most:
+            raise InputError(f"The scene draws pictures of at most {most} pixels, not {self.size}.")
+
+    def close(self) -> None:
+        """Free all renderers."""
+        for _, renderer in self._renderers.values():
+            renderer.close()
+        self._renderers.clear()

@@ -1,0 +1,105 @@
+"""Pictures of running episodes from a simulator's own cameras."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from clbench.base.errors import ClbenchError, InputError, UnknownNameError
+from clbench.evaluation.views import Views
+from clbench.spec.registry import load_scenario
+from clbench.testing import TOY
+from clbench.worlds.lanes import Lanes
+
+TASK = load_scenario("clbench/Fetch-v1").task("push_right")
+CAMERAS = ("external_camera_0", "gripper_camera_rgb")
+
+
+@pytest.fixture
+def lanes() -> Iterator[Lanes]:
+    """Yield two running episodes of Fetch, with the block in different places."""
+    lanes = Lanes(2)
+    lanes.reset([0, 1], [3, 4], [TASK, TASK])
+    yield lanes
+    lanes.close()
+
+
+@pytest.fixture
+def views() -> Iterator[Views]:
+    views = Views(CAMERAS, size=48)
+    yield views
+    views.close()
+
+
+def test_the_pictures_of_a_lane_are_those_that_mujoco_draws_of_it_upright(lanes: Lanes, views: Views) -> None:
+    drawn = [views.draw(lanes, lane, TASK) for lane in (0, 1)]
+    world: Any = lanes.world(TASK)
+    for lane, pictures in enumerate(drawn):
+        model, data, _ = world.drawable(lane)
+        assert tuple(pictures) == CAMERAS
+        with mujoco.Renderer(model, 48, 48) as renderer:
+            for name, picture in pictures.items():
+                assert (picture.shape, picture.dtype.name) == ((48, 48, 3), "uint8")
+                renderer.update_scene(data, camera=name)
+                assert np.array_equal(picture, renderer.render())
+    first, second = (pictures["external_camera_0"] for pictures in drawn)
+    assert not np.array_equal(first, second)
+
+
+def test_drawing_changes_no_step(lanes: Lanes, views: Views) -> None:
+    other = Lanes(2)
+    other.reset([0, 1], [3, 4], [TASK, TASK])
+    generator = np.random.default_rng(0)
+    for _ in range(5):
+        actions = generator.uniform(-1, 1, (2, 4)).astype(np.float32)
+        for lane in (0, 1):
+            views.draw(lanes, lane, TASK)
+        (found, *_), (expected, *_) = (some.step([0, 1], actions) for some in (lanes, other))
+        assert np.array_equal(found, expected)
+    other.close()
+
+
+@pytest.mark.parametrize(
+    ("cameras", "size", "error", "message"),
+    [
+        (["external_camera"], 48, UnknownNameError, "No camera of the scene .* 'external_camera_0'"),
+        (["lidar"], 481, InputError, "draws pictures of at most 480 pixels, not 481"),
+    ],
+)
+def test_a_picture_that_the_scene_does_not_have_is_refused(
+    cameras: list[str], size: int, error: type[ClbenchError], message: str, lanes: Lanes
+) -> None:
+    with pytest.raises(error, match=message):
+        Views(cameras, size).draw(lanes, 0, TASK)
+
+
+@pytest.mark.parametrize(
+    ("cameras", "size", "error", "message"),
+    [
+        (["lidar", "lidar"], 48, InputError, "each named once"),
+        ([1], 48, InputError, "each named once"),
+        (["lidar"], 0, InputError, "picture_size must be a whole number"),
+        (["lidar"], "48", InputError, "picture_size must be a whole number"),
+    ],
+)
+def test_cameras_and_sizes_that_mean_nothing_are_refused(
+    cameras: Any, size: Any, error: type[ClbenchError], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        Views(cameras, size)
+
+
+def test_a_world_that_nobody_can_draw_is_named() -> None:
+    lanes, task = Lanes(1), TOY.target[0]
+    lanes.reset([0], [0], [task])
+    message = f"{task.name!r} has no pictures: the vector world of .*ToyWorld has no drawable"
+    with pytest.raises(InputError, match=message):
+        Views(["front"]).draw(lanes, 0, task)
+    lanes.close()
+
+
+def test_without_a_camera_a_record_keeps_no_setting() -> None:
+    assert Views(()).settings == {}
+    assert Views(["agentview"]).settings == {"pictures": ["agentview"], "picture_size": 224}
