@@ -230,6 +230,8 @@ def play_chunks(
         InputError: The actions have the wrong shape, a chunk has another length, or nothing can be drawn.
         RenderingError: This machine cannot draw.
     """
+    if views is not None:
+        views.check(trial.task for trial in trials)
     player = _ChunkPlayer(policy, executed, whole, views)
     episodes = _play(player.act, scenario, trials, seed, "text", LANES, progress)
     assert player.executed is not None

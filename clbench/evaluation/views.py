@@ -6,7 +6,8 @@ alone.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from clbench.spec.fields import whole_number
 from clbench.spec.task import Task
 from clbench.worlds.gl_backend import RenderingError, draw_without_display
 from clbench.worlds.lanes import Lanes
+from clbench.worlds.world import Drawable
 
 if TYPE_CHECKING:
     import mujoco
@@ -50,20 +52,25 @@ class Views:
         """What the record of a run keeps, empty without a camera."""
         return {"pictures": list(self.cameras), "picture_size": self.size} if self.cameras else {}
 
+    def check(self, tasks: Iterable[Task]) -> None:
+        """Refuse cameras that the scene of one of the tasks does not have, before any episode is played.
+
+        Raises:
+            UnknownNameError: A scene has no such camera.
+            InputError: A world has no scene to draw, or a scene draws no picture of this size.
+        """
+        with closing(Lanes(1)) as lanes:
+            for task in dict.fromkeys(tasks):
+                lanes.reset([0], [0], [task])
+                self._check(_drawable(lanes, 0, task).model, task)
+
     def draw(self, lanes: Lanes, lane: int, task: Task) -> dict[str, NDArray[np.uint8]]:
         """Return the pictures (N, N, 3) of one lane, upright, by camera.
 
         Raises:
-            UnknownNameError: The scene has no such camera.
-            InputError: The world has no scene to draw, or the scene draws no picture of this size.
             RenderingError: This machine cannot draw.
         """
-        drawable = getattr(lanes.world(task), "drawable", None)
-        if drawable is None:
-            raise InputError(
-                f"The task {task.name!r} has no pictures: the vector world of {task.world} has no drawable()."
-            )
-        model, data, _ = drawable(lane)
+        model, data, _ = _drawable(lanes, lane, task)
         renderer, pictures = self._renderer(model), {}
         for name in self.cameras:
             renderer.update_scene(data, camera=name)
@@ -73,7 +80,6 @@ class Views:
     def _renderer(self, model: mujoco.MjModel) -> mujoco.Renderer:
         """Return the renderer of a scene, which is made on first use."""
         if id(model) not in self._renderers:
-            self._check(model)
             draw_without_display()
             import mujoco
 
@@ -86,12 +92,12 @@ class Views:
             self._renderers[id(model)] = model, renderer  # a scene that is kept keeps its id
         return self._renderers[id(model)][1]
 
-    def _check(self, model: mujoco.MjModel) -> None:
+    def _check(self, model: mujoco.MjModel, task: Task) -> None:
         """Refuse cameras that a scene does not have, and a size that it cannot draw."""
         known = [model.camera(number).name for number in range(model.ncam)]
         for name in self.cameras:
             if name not in known:
-                raise unknown("camera of the scene", name, known)
+                raise unknown(f"camera in the scene of {task.name}", name, known)
         most = min(model.vis.global_.offwidth, model.vis.global_.offheight)
         if self.size > most:
             raise InputError(f"The scene draws pictures of at most {most} pixels, not {self.size}.")
@@ -101,3 +107,14 @@ class Views:
         for _, renderer in self._renderers.values():
             renderer.close()
         self._renderers.clear()
+
+
+def _drawable(lanes: Lanes, lane: int, task: Task) -> Drawable:
+    """Return what the pictures of a lane are drawn from."""
+    drawable = getattr(lanes.world(task), "drawable", None)
+    if drawable is None:
+        raise InputError(
+            f"The task {task.name!r} has no pictures: the vector world of {task.world} has no drawable()."
+        )
+    found: Drawable = drawable(lane)
+    return found

@@ -64,15 +64,20 @@ def test_drawing_changes_no_step(lanes: Lanes, views: Views) -> None:
 @pytest.mark.parametrize(
     ("cameras", "size", "error", "message"),
     [
-        (["external_camera"], 48, UnknownNameError, "No camera of the scene .* 'external_camera_0'"),
+        (
+            ["external_camera"],
+            48,
+            UnknownNameError,
+            "camera in the scene of push_right .* 'external_camera_0'",
+        ),
         (["lidar"], 481, InputError, "draws pictures of at most 480 pixels, not 481"),
     ],
 )
 def test_a_picture_that_the_scene_does_not_have_is_refused(
-    cameras: list[str], size: int, error: type[ClbenchError], message: str, lanes: Lanes
+    cameras: list[str], size: int, error: type[ClbenchError], message: str
 ) -> None:
     with pytest.raises(error, match=message):
-        Views(cameras, size).draw(lanes, 0, TASK)
+        Views(cameras, size).check([TASK])
 
 
 @pytest.mark.parametrize(
@@ -92,12 +97,10 @@ def test_cameras_and_sizes_that_mean_nothing_are_refused(
 
 
 def test_a_world_that_nobody_can_draw_is_named() -> None:
-    lanes, task = Lanes(1), TOY.target[0]
-    lanes.reset([0], [0], [task])
+    task = TOY.target[0]
     message = f"{task.name!r} has no pictures: the vector world of .*ToyWorld has no drawable"
     with pytest.raises(InputError, match=message):
-        Views(["front"]).draw(lanes, 0, task)
-    lanes.close()
+        Views(["front"]).check([task])
 
 
 def test_without_a_camera_a_record_keeps_no_setting() -> None:

@@ -39,6 +39,7 @@ def _drawn(self: Views, lanes: Any, lane: int, task: Any) -> dict[str, Any]:
 def test_a_policy_gets_the_pictures_of_each_episode_and_the_record_keeps_which(
     run: Callable[..., Record], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(Views, "check", lambda *_: None)
     monkeypatch.setattr(Views, "draw", _drawn)
     seen: list[dict[str, Any]] = []
 
@@ -62,6 +63,7 @@ def test_a_policy_gets_the_pictures_of_each_episode_and_the_record_keeps_which(
 def test_all_stages_have_the_same_pictures(
     run: Callable[..., Record], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(Views, "check", lambda *_: None)
     monkeypatch.setattr(Views, "draw", _drawn)
     run(idle, 0, pictures=["front"], picture_size=8)
     for other in ({}, {"pictures": ["wrist"], "picture_size": 8}, {"pictures": ["front"]}):
