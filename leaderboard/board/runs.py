@@ -291,10 +291,10 @@ def same_definition(runs: list[Run]) -> Sifted:
     A record is kept if it is older than definitions, or than the parts of `LATER` in which it would differ.
     """
     elsewhere = {run.table for run in runs} - {run.table for run in runs if not _is_of_arm(run)}
-    free = [run for run in runs if run.record.run.scenario not in pinned() or run.table in elsewhere]
-    kept, refused = _same_parts(free, later=False)
+    by_pin = {run for run in runs if run.record.run.scenario in pinned() and run.table not in elsewhere}
+    kept, refused = _same_parts([run for run in runs if run not in by_pin], later=False)
     kept, others = _same_parts(kept, later=True)
-    here, changed = sift_by((run for run in runs if run not in free), unlike_the_pin)
+    here, changed = sift_by((run for run in runs if run in by_pin), unlike_the_pin)
     return [*kept, *here], [*refused, *others, *changed]
 
 
