@@ -52,7 +52,7 @@ AFTER_PRETRAINING = (
 
 
 def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
-    """Return everything that a pretrained policy depends on."""
+    """Return everything that a pretrained policy depends on: its seed, or the weights that it brings."""
     tasks = scenario.pretrained + scenario.scenes
     suites = {
         *packages_of(tasks, "world", "expert", "camera"),
@@ -60,17 +60,17 @@ def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
         *policy_packages(scenario.policy),
     }
     budget = dataclasses.asdict(scenario.budget)
+    own = _own_weights(scenario, seed)
     installed = {**simulator_versions(tasks), **versions(("torch", "tokenizers"))}
     return {
         "retained": [dataclasses.asdict(task) for task in scenario.pretrained],
         "scenes": [dataclasses.asdict(task) for task in scenario.scenes],
         "budget": {name: value for name, value in budget.items() if name not in AFTER_PRETRAINING},
-        "seed": seed,
+        **(own or {"seed": seed}),
         "text_length": scenario.text_length,
         "policy": scenario.policy,
         "frame": frame_hash(scenario.scene_tasks[0]),
         "source": source_hash(*TRAINING_SOURCES, *suites),
-        **_own_weights(scenario, seed),
         # a label such as torch's +cpu names other abilities of a build; pretraining does not use them
         "versions": {name: version.partition("+")[0] for name, version in installed.items()},
     }
@@ -111,7 +111,9 @@ def _folder(scenario: Scenario, seed: int, inputs: Mapping[str, Any]) -> Path:
     shipped = shipped_folder(scenario, seed)
     if is_cached(shipped, inputs):
         return shipped
-    return cache_folder() / "pretrained" / f"{shipped.name}-{hash_of(inputs)}"
+    # weights that a class brings may be the same for all seeds, and a large policy needs no copy for each
+    name = shipped.name if "seed" in inputs else shipped.name.removesuffix(f"-seed-{seed}")
+    return cache_folder() / "pretrained" / f"{name}-{hash_of(inputs)}"
 
 
 def pretrained_policy(

@@ -44,7 +44,8 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         episodes_per_stage: Episodes after which an environment goes on to the next stage.
         stage: Stage to stay in, for an agent that is trained stage by stage; None goes through all stages.
         order: Order of the targets, see `Scenario.in_order`; 0 is the published order.
-        task: Name of the only task; None has those of the stages.
+        task: Name of the only task, or one for each environment, for example to learn all at once; None has
+            those of the stages.
         threads: Threads that step the worlds, by default one per core, at most one per environment.
             Results do not depend on it.
         render_mode: None; environments side by side cannot be drawn.
@@ -67,7 +68,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         episodes_per_stage: int = 100,
         stage: int | None = None,
         order: int = 0,
-        task: str | None = None,
+        task: str | Sequence[str] | None = None,
         threads: int | None = None,
         render_mode: str | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
@@ -94,7 +95,8 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         self.begun_at: float | None = None
         """Start of the first episodes in seconds, by `time.perf_counter`."""
         self._schedules = [
-            Schedule(self.scenario, episodes_per_stage, instruction, stage, task) for _ in range(num_envs)
+            Schedule(self.scenario, episodes_per_stage, instruction, stage, one)
+            for one in _one_each(task, num_envs)
         ]
         self._generators = [np_random() for _ in range(num_envs)]
         self._lanes = Lanes(num_envs, min(num_envs, threads or cores()))  # more would never get work
@@ -289,6 +291,19 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         for name, column in {**self._told, "success": successes}.items():
             info[name], info[f"_{name}"] = column.copy(), self._known.copy()
         return info
+
+
+def _one_each(task: str | Sequence[str] | None, count: int) -> Sequence[str | None]:
+    """Return a task for each environment.
+
+    Raises:
+        InputError: There are more tasks than environments, or fewer.
+    """
+    if task is None or isinstance(task, str):
+        return [task] * count
+    if len(task) != count:
+        raise InputError(f"{count} environments need as many tasks, or one for all, not {len(task)}.")
+    return list(task)
 
 
 def _mode(chosen: str | AutoresetMode) -> AutoresetMode:

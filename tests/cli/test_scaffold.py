@@ -159,6 +159,8 @@ def test_runs_start_from_the_weights_that_a_policys_own_file_has_now(tmp_path: P
         assert {one for weight in policy.parameters() for one in weight.flatten().tolist()} == {float(value)}
         found.append(folder)
     assert found[0] == found[2] != found[1]
+    # equal weights are kept once, whatever the seed
+    assert pretrained_policy(scenario, seed=1)[1] == found[2]
 
 
 def test_a_method_whose_need_a_fresh_policy_lacks_is_refused_by_name(fresh_policy: str) -> None:

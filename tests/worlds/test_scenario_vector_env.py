@@ -1,6 +1,7 @@
 """The vector environments of scenarios, against Gymnasium's own vector of plain environments."""
 
 import pickle
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, VectorEnv
 
+from clbench.base.errors import InputError, UnknownNameError
 from clbench.testing import ToyWorld
 from clbench.worlds.lanes import PlainVectorWorld
 from clbench.worlds.scenario_vector_env import ScenarioVectorEnv
@@ -80,6 +82,27 @@ def test_it_does_so_where_success_is_judged_at_the_horizon(monkeypatch: pytest.M
 @pytest.mark.long
 def test_it_does_so_with_the_suites_own_vector_world() -> None:
     assert _run_together(FETCH, 130, 0.0, instruction="tokens", episodes_per_stage=2) >= 6
+
+
+def test_each_environment_may_have_a_task_of_its_own() -> None:
+    tasks = ["right", "left", "down"]
+    ours = gymnasium.make_vec(TOY, num_envs=3, task=tasks)
+    plain = gymnasium.vector.SyncVectorEnv([partial(gymnasium.make, TOY, task=task) for task in tasks])
+    _same(ours.reset(seed=7), plain.reset(seed=7))
+    for _ in range(30):
+        actions = ours.action_space.sample()
+        outcome = ours.step(actions)
+        _same(outcome, plain.step(actions))
+        assert list(outcome[-1]["task"]) == tasks
+    ours.close()
+    plain.close()
+
+
+def test_as_many_tasks_as_environments_are_needed() -> None:
+    with pytest.raises(InputError, match="2 environments need as many tasks, or one for all, not 1"):
+        _toy(task=["left"])
+    with pytest.raises(UnknownNameError, match=r"'lift'.*Did you mean 'left'"):
+        _toy(task=["left", "lift"])
 
 
 def _toy(**options: Any) -> ScenarioVectorEnv:
