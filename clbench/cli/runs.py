@@ -153,7 +153,7 @@ def score(
     data: str | None = None,
     steps: Annotated[int | None, whole_number(0)] = None,
     pictures: str | None = None,
-    picture_size: Annotated[int, whole_number(1)] = 224,
+    picture_size: Annotated[int | None, whole_number(1)] = None,
     timeout: Annotated[int, whole_number(1)] = 300,
     restart: Annotated[bool, Parameter(negative="")] = False,
     records: Path = RECORDS,
@@ -177,7 +177,7 @@ def score(
         steps: Optimiser steps of the stage. The record keeps them.
         pictures: Cameras of the simulator whose pictures the policy gets, separated by commas, for example
             agentview,robot0_eye_in_hand. They are the same in all stages.
-        picture_size: Height and width of these pictures in pixels.
+        picture_size: Height and width of these pictures in pixels (default: 224).
         timeout: Time limit of a reply in seconds; the first reply may include compilation.
         restart: Score a finished stage again. This drops the stage and all later ones, but never a finished
             record.
@@ -202,8 +202,7 @@ def score(
         "executed": executed,
         "data": data,
         "steps": steps,
-        "pictures": [] if pictures is None else items_of("--pictures", pictures),
-        "picture_size": picture_size,
+        **_pictures(pictures, picture_size),
         "restart": restart,
         "records": records,
     }
@@ -230,6 +229,15 @@ def score(
     else:
         then = f"Record: {path}\nIt is a tuning run, on validation episodes: no board shows it."
     print_plain(console, then)
+
+
+def _pictures(cameras: str | None, size: int | None) -> dict[str, Any]:
+    """Return the options of `score` on pictures."""
+    with checked_input():
+        if cameras is None and size is not None:
+            raise InputError("--picture-size is the size of the pictures of --pictures: name cameras there.")
+        chosen = [] if cameras is None else items_of("--pictures", cameras)
+    return {"pictures": chosen, **({} if size is None else {"picture_size": size})}
 
 
 def _rates(record: Record) -> str:

@@ -57,12 +57,24 @@ class Views:
 
         Raises:
             UnknownNameError: A scene has no such camera.
-            InputError: A world has no scene to draw, or a scene draws no picture of this size.
+            InputError: A world has no scene to draw, the scenes have no camera in common, or one draws no
+                picture of this size.
         """
+        names, sizes = [], []
         with closing(Lanes(1)) as lanes:
             for task in dict.fromkeys(tasks):
                 lanes.reset([0], [0], [task])
-                self._check(_drawable(lanes, 0, task).model, task)
+                model = _drawable(lanes, 0, task).model
+                names.append({model.camera(number).name for number in range(model.ncam)})
+                sizes.append(min(model.vis.global_.offwidth, model.vis.global_.offheight))
+        common = set.intersection(*names) - {""}
+        for name in self.cameras:
+            if not common:
+                raise InputError(f"There is no camera {name!r}: the scenes of the tasks have none in common.")
+            if name not in common:
+                raise unknown("camera in the scenes of all tasks", name, common)
+        if self.size > min(sizes):
+            raise InputError(f"The scenes draw pictures of at most {min(sizes)} pixels, not {self.size}.")
 
     def draw(self, lanes: Lanes, lane: int, task: Task) -> dict[str, NDArray[np.uint8]]:
         """Return the pictures (N, N, 3) of one lane, upright, by camera.
@@ -91,16 +103,6 @@ class Views:
                 ) from error
             self._renderers[id(model)] = model, renderer  # a scene that is kept keeps its id
         return self._renderers[id(model)][1]
-
-    def _check(self, model: mujoco.MjModel, task: Task) -> None:
-        """Refuse cameras that a scene does not have, and a size that it cannot draw."""
-        known = [model.camera(number).name for number in range(model.ncam)]
-        for name in self.cameras:
-            if name not in known:
-                raise unknown(f"camera in the scene of {task.name}", name, known)
-        most = min(model.vis.global_.offwidth, model.vis.global_.offheight)
-        if self.size > most:
-            raise InputError(f"The scene draws pictures of at most {most} pixels, not {self.size}.")
 
     def close(self) -> None:
         """Free all renderers."""

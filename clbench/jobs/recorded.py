@@ -115,7 +115,8 @@ def changed_code(record: Record, run: ResolvedRun) -> list[str]:
             "weights": f"the weights of {policy} have changed",
         }
         now = describe_policy(run.scenario, run.spec.seed)
-        changed += [clauses[name] for name in now if record.fingerprint.get(name) != now[name]]
+        known = {"weights": now.get("weights"), **record.fingerprint}  # older records have no weights
+        changed += [clauses[name] for name in now if known.get(name) != now[name]]
     return changed
 
 

@@ -16,8 +16,9 @@ from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
-from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
 from websockets.sync.client import ClientConnection, connect
+from websockets.uri import parse_uri
 
 from clbench.base.errors import InputError
 from clbench.base.text import printable, shortened
@@ -229,11 +230,10 @@ class ServedPolicy:
 
 
 def _is_address(text: str) -> bool:
+    """Return whether websockets accepts an address; its own error would show the password."""
     try:
-        parts = urlsplit(text)
-        is_whole = (parts.username is None) == (parts.password is None)
-        return parts.scheme in ("ws", "wss") and bool(parts.hostname) and parts.port != 0 and is_whole
-    except ValueError:  # the port is no number
+        return parse_uri(text).port != 0
+    except (InvalidURI, ValueError):  # the port is no number, or a password is no UTF-8
         return False
 
 

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from clbench.records.paths import label_of
 from clbench.runs.tuning import rated_best, tuned
@@ -64,13 +65,28 @@ def ladder_of(records: Path) -> Path:
     return beside(records, LADDER.name)
 
 
-def read_ladder(folder: Path) -> Sifted:
+def read_ladder(folder: Path, board: Iterable[Run] = ()) -> Sifted:
     """Return the runs of the ladder below `folder` by scenario, and the files that are no such run.
 
     Their paths begin with the folder's name. A missing folder counts as empty.
+
+    Args:
+        folder: The folder.
+        board: Runs of the board. Their worlds must move as those of the ladder, or no gain could be computed.
     """
+
+    def rollouts(run: Run) -> Any:
+        return run.record.fingerprint.get("rollouts")
+
+    def reason(run: Run) -> str:
+        alike = rollouts(run) == moved.get(run.table, rollouts(run))
+        return "" if alike else "its simulator does not match that of the board's records."
+
+    moved = {run.table: rollouts(run) for run in board}
     runs, refused = read_runs(folder, partial(read_run, changed=True), (*ALIKE, on_the_ladder))
+    runs, others = sift_by(runs, reason)
     runs.sort(key=lambda run: run.table)
+    refused = [*refused, *others]
     return runs, [dataclasses.replace(one, path=f"{folder.name}/{one.path}") for one in refused]
 
 

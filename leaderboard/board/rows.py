@@ -93,7 +93,7 @@ def compute_board(records: Path, only: Container[str] | None = None) -> Board:
     found = [_scenario_rows(members) for members in by_table.values()]
     found.sort(key=lambda rows: not rows[0].to_criterion)  # stages to a criterion first
     by_name = {rows[0].scenario: rows for rows in found}
-    ladder, without = read_ladder(ladder_of(records)) if only is None else ([], [])
+    ladder, without = read_ladder(ladder_of(records), runs) if only is None else ([], [])
     return Board(
         scenarios={run.table: run.published for run in runs},
         rows=tuple(chain.from_iterable(found)),

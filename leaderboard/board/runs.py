@@ -287,22 +287,34 @@ def same_simulator(runs: list[Run]) -> Sifted:
 def same_definition(runs: list[Run]) -> Sifted:
     """Keep the runs whose scenario is defined as here, or, if it is not the project's, as in most records.
 
-    A table whose runs are all of ARM processors, where worlds move otherwise, is compared with itself, too.
-    A record is kept if it is older than definitions, or than the parts of `LATER` in which it would differ.
+    Worlds move otherwise on ARM processors. A table without a run of the pinned definition is compared with
+    itself if all others are of ARM, but for the parts that do not depend on the processor. A record is kept
+    if it is older than definitions, or than the parts of `LATER` in which it would differ.
     """
-    elsewhere = {run.table for run in runs} - {run.table for run in runs if not _is_of_arm(run)}
-    by_pin = {run for run in runs if run.record.run.scenario in pinned() and run.table not in elsewhere}
-    kept, refused = _same_parts([run for run in runs if run not in by_pin], later=False)
+    ours = [run for run in runs if run.record.run.scenario in pinned()]
+    fitting = {run.table for run in ours if not unlike_the_pin(run)}
+    alone = {run for run in ours if _is_of_arm(run) and run.table not in fitting}
+    here, changed = sift_by(ours, lambda run: unlike_the_pin(run, moves=run in alone))
+    free = [*(run for run in runs if run.record.run.scenario not in pinned()), *alone.intersection(here)]
+    kept, refused = _same_parts(free, later=False)
     kept, others = _same_parts(kept, later=True)
-    here, changed = sift_by((run for run in runs if run in by_pin), unlike_the_pin)
-    return [*kept, *here], [*refused, *others, *changed]
+    return [*kept, *(run for run in here if run not in alone)], [*refused, *others, *changed]
 
 
-def unlike_the_pin(run: Run) -> str:
-    """Return in which parts the definition of a run of the project's scenarios is not the pinned one."""
+def unlike_the_pin(run: Run, moves: bool = False) -> str:
+    """Return in which parts the definition of a run of the project's scenarios is not the pinned one.
+
+    Args:
+        run: The run.
+        moves: Whether its worlds may move otherwise: tasks and questions, which come from episodes, then do
+            not count.
+    """
     scenario = run.record.run.scenario
-    other = other_parts(_definition(run), pinned().get(scenario, {}))
-    if scenario not in pinned() or not other:
+    if scenario not in pinned():
+        return ""
+    other = other_parts(_definition(run), pinned()[scenario])
+    other = [name for name in other if not (moves and name.startswith(("task ", "questions")))]
+    if not other:
         return ""
     where = f" Worlds may move otherwise on {machine_of(run.record.fingerprint)}." if _is_of_arm(run) else ""
     return f"it was made with another {scenario}: {', '.join(other)} differ.{where}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from itertools import chain
 from typing import Any
 
@@ -53,8 +54,8 @@ CONSFT = Paper("ConSFT", ("2605.08879",))
 @claim(
     "C1",
     CONSFT,
-    reported="0.49 on prior tasks before sft, 0.09 after (pi0, LIBERO, Table 2); that sft also overwrites "
-    "the weights densely is shown here by its update sparsity, and not judged",
+    reported="0.49 on prior tasks before sft, 0.09 after (pi0, LIBERO, Table 2); the weights are overwritten "
+    "densely",
     rule="Holds if the lower end of the drop in retained success with sft at its best learning rate is above "
     "0.05; does not hold if the upper end is below 0.05.",
     settled="2026-11-23T07:13Z",
@@ -65,7 +66,7 @@ def sft_degrades(evidence: Evidence) -> Finding:
     """Fine-tuning without constraint degrades pretrained skills."""
     drop, published = (retention_drop(evidence, label) for label in ("sft", rung("sft", PUBLISHED)))
     joint = kept(evidence, "joint", rung("sft", PUBLISHED))  # joint has the scenario's learning rate
-    sparse = evidence.metric("update_sparsity", "sft")
+    sparse = replace(evidence.metric("update_sparsity", "sft"), note="density is not judged")
     return Finding(
         decided(holds=drop.low > 0.05, fails=drop.high < 0.05),
         (drop, published),

@@ -25,9 +25,10 @@ INTRODUCTION = (
     "figures and tables, comes from notes by other readers. We have read the paper on Fast-dVLA. "
     "The rules were "
     "written before the records of these boards, but some changed later: the list says how many, each rule "
-    "says when, and docs/history.md says why. Four choices were made when the records of these boards were "
+    "says when, and docs/history.md says why. Six choices were made when the records of these boards were "
     "already known: to judge C1 on clbench/LiberoSpatial-v1, A5 on clbench/FetchKnowledge-v1 and A2 on "
-    "clbench/Fetch-v1 and clbench/MetaWorld-v1, and to judge A6 by other quantities. "
+    "clbench/Fetch-v1 and clbench/MetaWorld-v1, to judge A6 by other quantities and C4 by another control, "
+    "and to compare F2 with the objective. "
     "One review of the rules turned 15 "
     'of 41 verdicts without a new record, 13 of them into "cannot be shown here"; docs/history.md lists '
     "them, and says that boards got more seeds after a first look. `sft` is plain fine-tuning. Most claims "

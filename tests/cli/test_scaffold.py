@@ -18,6 +18,7 @@ from clbench.jobs.recorded import has_record, set_aside
 from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.registry import load_method
 from clbench.records.reader import read_record
+from clbench.records.writer import write_record
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.scoring.metrics import measure
@@ -316,3 +317,14 @@ def test_a_record_counts_only_for_the_weights_that_its_policy_brings_now(tmp_pat
     said = set_aside(spec.resolve(), records)
     assert said is not None
     assert "the weights of own_policy:Own have changed since. It is renamed to seed-0.json.old" in said
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("fresh_policy")
+def test_an_older_record_that_names_no_weights_counts(tmp_path: Path) -> None:
+    own_weights(tmp_path, "0.5")
+    spec, records = RunSpec(TINY.id, "frozen", 0, policy="own_policy:Own"), tmp_path / "records"
+    record = execute(spec, records)
+    del record.fingerprint["weights"]
+    write_record(record, spec.path(records))
+    assert has_record(spec.resolve(), records)

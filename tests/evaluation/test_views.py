@@ -1,6 +1,7 @@
 """Pictures of running episodes from a simulator's own cameras."""
 
 from collections.abc import Iterator
+from contextlib import closing
 from typing import Any
 
 import mujoco
@@ -8,6 +9,8 @@ import numpy as np
 import pytest
 
 from clbench.base.errors import ClbenchError, InputError, UnknownNameError
+from clbench.evaluation.episodes import LANES, Trial
+from clbench.evaluation.players import play_chunks
 from clbench.evaluation.views import Views
 from clbench.spec.registry import load_scenario
 from clbench.testing import TOY
@@ -68,9 +71,9 @@ def test_drawing_changes_no_step(lanes: Lanes, views: Views) -> None:
             ["external_camera"],
             48,
             UnknownNameError,
-            "camera in the scene of push_right .* 'external_camera_0'",
+            "camera in the scenes of all tasks .* 'external_camera_0'",
         ),
-        (["lidar"], 481, InputError, "draws pictures of at most 480 pixels, not 481"),
+        (["lidar"], 481, InputError, "draw pictures of at most 480 pixels, not 481"),
     ],
 )
 def test_a_picture_that_the_scene_does_not_have_is_refused(
@@ -101,6 +104,29 @@ def test_a_world_that_nobody_can_draw_is_named() -> None:
     message = f"{task.name!r} has no pictures: the vector world of .*ToyWorld has no drawable"
     with pytest.raises(InputError, match=message):
         Views(["front"]).check([task])
+
+
+def test_a_policy_that_acts_on_a_real_scene_gets_its_pictures() -> None:
+    scenario = load_scenario("clbench/Fetch-v1")
+    trials = [Trial(TASK, "validation", number) for number in range(2)]
+    seen: list[dict[str, Any]] = []
+
+    def act(observations: dict[str, Any]) -> Any:
+        seen.append(observations)
+        return np.zeros((LANES, TASK.horizon, 4))
+
+    with closing(Views(CAMERAS, 32)) as views:
+        play_chunks(act, scenario, trials, 0, views=views)
+    (observations,) = seen
+    pictures = observations["pictures/external_camera_0"]
+    assert (pictures.shape, pictures.dtype.name) == ((LANES, 32, 32, 3), "uint8")
+    assert not np.array_equal(pictures[0], pictures[1])
+    assert np.array_equal(pictures[0], pictures[2])  # an unused row
+
+
+def test_scenes_without_a_common_camera_are_refused() -> None:
+    with pytest.raises(InputError, match="no camera 'fixed': the scenes of the tasks have none in common"):
+        Views(["fixed"]).check(load_scenario("clbench/DMControl-v0").retained)
 
 
 def test_without_a_camera_a_record_keeps_no_setting() -> None:

@@ -191,6 +191,8 @@ def test_a_token_that_cannot_be_sent_is_refused_and_not_shown(
         ("ws://sekret@localhost:1", "ws://localhost:1"),
         ("user:sekret@localhost:1", "localhost:1"),
         ("http://user:sekret@localhost:1", "http://localhost:1"),
+        ("ws://user:sekret@localhost:1/x#y", "ws://localhost:1/x#y"),
+        ("ws://sekret:pa%ff@localhost:1", "ws://localhost:1"),
     ],
 )
 def test_no_message_shows_the_password_of_an_address(

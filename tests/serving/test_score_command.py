@@ -85,6 +85,10 @@ def test_the_command_says_that_no_board_shows_a_tuning_seed(
         ({"stage": 1}, "error: Stage 0 of me/elsewhere, seed 0, on clbench/Toy-v0 comes next, not 1: "),
         ({"method": "me.module:Class"}, "error: 'me.module:Class' is the name of a class"),
         ({"method": "sft"}, "error: 'sft' is a method of clbench"),
+        (
+            {"picture_size": 8},
+            "--picture-size is the size of the pictures of --pictures: name cameras there.",
+        ),
     ],
 )
 def test_the_command_explains_a_wrong_value_in_one_line(

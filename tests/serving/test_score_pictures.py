@@ -75,3 +75,19 @@ def test_all_stages_have_the_same_pictures(
     assert is_scored(ID, **options, pictures=["front"], picture_size=8)
     with pytest.raises(InputError, match=r"scored with pictures \['front'\], not \['wrist'\]"):
         is_scored(ID, **options, pictures=["wrist"], picture_size=8)
+
+
+def test_a_run_may_start_over_with_other_pictures_and_older_stages_have_none(
+    run: Callable[..., Record], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Views, "check", lambda *_: None)
+    monkeypatch.setattr(Views, "draw", _drawn)
+    run(idle, 0)
+    with pytest.raises(
+        InputError, match=r"are .*'pictures': \['front'\].*, but were {'executed': 1} in stage 0"
+    ):
+        run(idle, 1, pictures=["front"])
+    record = run(idle, 0, pictures=["front"], picture_size=8, restart=True)
+    assert record.run.settings == {"executed": 1, "pictures": ["front"], "picture_size": 8}
+    again = run(idle, 0, restart=True)
+    assert again.run.settings == {"executed": 1}

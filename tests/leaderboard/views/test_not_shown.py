@@ -200,6 +200,27 @@ def test_records_that_are_all_of_arm_make_a_table_that_says_so(
         assert "Fetch-v1/sft/seed-1.json" not in flat(text)
 
 
+def test_of_arm_records_only_what_episodes_show_may_differ_and_a_refused_record_hides_none(
+    add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+) -> None:
+    ours = pinned()["clbench/Fetch-v1"]
+    rule = next(name for name in ours if name.startswith("rule "))
+    changes = [{"task press": "0"}, {"task press": "0", rule: "loose"}, {"task press": "1"}]
+    machines = ["arm64", "arm64", "x86_64"]
+    for seed, (changed, machine) in enumerate(zip(changes, machines, strict=True)):
+
+        def edit(record: Record, changed: dict[str, str] = changed, machine: str = machine) -> None:
+            record.fingerprint |= {"definition": {**ours, **changed}, "hardware": {"machine": machine}}
+
+        add_full("sft", seed, edit=edit, scenario="clbench/Fetch-v1", place=f"Fetch-v1/sft/seed-{seed}.json")
+    for text in shown():
+        assert "All these records were made on arm64" in flat(text)
+        words = "it was made with another clbench/Fetch-v1"
+        assert f"Fetch-v1/sft/seed-1.json: {words}: {rule} differ." in flat(text)
+        assert f"Fetch-v1/sft/seed-2.json: {words}: task press differ." in flat(text)
+        assert "Fetch-v1/sft/seed-0.json" not in flat(text)
+
+
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"a": 1}', '{"schema": 99}', "[" * 99_999, "\x00"])
 def test_a_file_that_is_no_record_is_listed_and_hides_no_other(
     content: str, four_methods: Path, shown: Callable[[], tuple[str, str]]
