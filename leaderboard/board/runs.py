@@ -304,16 +304,11 @@ def same_definition(runs: list[Run]) -> Sifted:
 def unlike_the_pin(run: Run, moves: bool = False) -> str:
     """Return in which parts the definition of a run of the project's scenarios is not the pinned one.
 
-    Args:
-        run: The run.
-        moves: Whether its worlds may move otherwise: tasks and questions, which come from episodes, then do
-            not count.
+    If its worlds may move otherwise (`moves`), tasks and questions do not count: they come from episodes.
     """
     scenario = run.record.run.scenario
-    if scenario not in pinned():
-        return ""
-    other = other_parts(_definition(run), pinned()[scenario])
-    other = [name for name in other if not (moves and name.startswith(("task ", "questions")))]
+    parts = other_parts(_definition(run), pinned()[scenario]) if scenario in pinned() else []
+    other = [name for name in parts if not (moves and name.startswith(("task ", "questions")))]
     if not other:
         return ""
     where = f" Worlds may move otherwise on {machine_of(run.record.fingerprint)}." if _is_of_arm(run) else ""
