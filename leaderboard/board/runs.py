@@ -287,16 +287,16 @@ def same_simulator(runs: list[Run]) -> Sifted:
 def same_definition(runs: list[Run]) -> Sifted:
     """Keep the runs whose scenario is defined as here, or, if it is not the project's, as in most records.
 
-    Worlds move otherwise on ARM processors. A table without a run of the pinned definition is compared with
-    itself if all others are of ARM, but for the parts that do not depend on the processor. A record is kept
-    if it is older than definitions, or than the parts of `LATER` in which it would differ.
+    Worlds move otherwise on ARM: without a run of the pinned definition, a table's runs of ARM are compared
+    with one another, and with the pin in what depends on no processor. A record is kept if it is older than
+    definitions, or than the parts of `LATER` in which it would differ.
     """
     ours = [run for run in runs if run.record.run.scenario in pinned()]
     fitting = {run.table for run in ours if not unlike_the_pin(run)}
     alone = {run for run in ours if _is_of_arm(run) and run.table not in fitting}
     here, changed = sift_by(ours, lambda run: unlike_the_pin(run, moves=run in alone))
-    free = [*(run for run in runs if run.record.run.scenario not in pinned()), *alone.intersection(here)]
-    kept, refused = _same_parts(free, later=False)
+    theirs = [run for run in runs if run.record.run.scenario not in pinned()]
+    kept, refused = _same_parts([*theirs, *(run for run in here if run in alone)], later=False)
     kept, others = _same_parts(kept, later=True)
     return [*kept, *(run for run in here if run not in alone)], [*refused, *others, *changed]
 
