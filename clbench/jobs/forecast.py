@@ -61,8 +61,9 @@ def forecast(plan: Plan, runs: Sequence[ResolvedRun], workers: int, checkpoints:
 
 
 def _time(jobs: Sequence[Job], scenarios: Sequence[Scenario], at_once: int) -> str:
-    slowest = max(map(step_seconds, scenarios))
-    usual = max(step_seconds(one.with_policy(DEFAULT_POLICY)) for one in scenarios)
+    defaults = [one.with_policy(DEFAULT_POLICY) for one in scenarios]
+    times = {one: step_seconds(one) for one in dict.fromkeys([*scenarios, *defaults])}  # often the same
+    slowest, usual = (max(times[one] for one in some) for some in (scenarios, defaults))
     at_once = min(at_once, len(jobs))
 
     def seconds_of(job: Job) -> float:

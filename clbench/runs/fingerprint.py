@@ -93,8 +93,8 @@ def describe_policy(scenario: Scenario, seed: int) -> dict[str, str | None]:
         return {"policy": None}
     from clbench.learning.pretraining import pretraining_inputs  # imports torch, see `_hardware`
 
-    inputs = pretraining_inputs(scenario, seed)
-    return {"policy": source, **{name: inputs[name] for name in ("weights",) if name in inputs}}
+    weights = pretraining_inputs(scenario, seed).get("weights")
+    return {"policy": source, **({"weights": weights} if weights else {})}
 
 
 def _commit() -> dict[str, Any] | None:

@@ -88,10 +88,10 @@ def lerobot_policy(
     The batch that `preprocess` receives has `observation.state`, float32 (B, S), `task`, a list of B texts,
     and with a camera `observation.images.<camera>`, float32 (B, 3, N, N) from 0 to 1, as for each camera of
     `clbench score --pictures`. Without a camera it has the state as `observation.environment_state`, too: ACT
-    refuses to go without both. `postprocess` receives
-    the actions (B, A) of one step after another, as in LeRobot's own server. Without `noise`, a policy draws
-    from PyTorch's generator, which is seeded before each call by all seeds and steps together: the same
-    request has the same reply, but the noise of an episode depends on the other ones in its request.
+    refuses to go without both. `postprocess` receives the actions (B, A) of one step after another, as in
+    LeRobot's own server. Without `noise`, a policy draws from PyTorch's generator, which is seeded before
+    each call by all seeds and steps together: the same request has the same reply, but the noise of an
+    episode depends on the other ones in its request.
 
     Args:
         policy: A `PreTrainedPolicy` whose `predict_action_chunk` needs no earlier observations: ACT, or

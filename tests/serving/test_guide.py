@@ -164,6 +164,8 @@ def test_the_programs_for_other_libraries_serve_their_policies(program: str, tmp
         "instruction": ["go left"] * 40,
         "seed": np.arange(40),
         "step": np.zeros(40, np.int64),
+        "pictures/agentview": np.zeros((40, 8, 8, 3), np.uint8),
+        "pictures/robot0_eye_in_hand": np.zeros((40, 8, 8, 3), np.uint8),
     }
     with served_by(program, tmp_path) as address:
         served = ServedPolicy(address)

@@ -29,21 +29,6 @@ from clbench.spec.language import encode
 STAGES = range(3)
 
 
-@pytest.fixture
-def run(tmp_path: Path, empty_caches: Path) -> Callable[..., Record]:
-    """Return `score` for the method me/elsewhere on the toy, with records and caches for one test."""
-
-    def run(policy: Any, stage: int, **options: Any) -> Record:
-        return score(
-            ID,
-            policy,
-            stage=stage,
-            **{"method": "me/elsewhere", "records": tmp_path / "records", **options},
-        )
-
-    return run
-
-
 def knowing(stage: int, length: int = 1) -> Callable[[dict[str, Any]], Any]:
     """Return the policy that acts like `Knowing` after a stage, in chunks of `length` actions."""
     agent = Knowing(*LEARNED[stage])

@@ -11,18 +11,7 @@ from agents import ID
 from clbench.base.errors import InputError
 from clbench.evaluation.views import Views
 from clbench.records.record import Record
-from clbench.serving.score import is_scored, score
-
-
-@pytest.fixture
-def run(tmp_path: Path, empty_caches: Path) -> Callable[..., Record]:
-    """Return `score` for the method me/elsewhere on the toy, with records and caches for one test."""
-
-    def run(policy: Any, stage: int, **options: Any) -> Record:
-        rest = {"method": "me/elsewhere", "records": tmp_path / "records", **options}
-        return score(ID, policy, stage=stage, **rest)
-
-    return run
+from clbench.serving.score import is_scored
 
 
 def idle(observations: dict[str, Any]) -> Any:
