@@ -31,6 +31,7 @@ from clbench.spec.policies import DEFAULT_POLICY, SMALL, kind_of, policy_name
 
 if TYPE_CHECKING:
     from clbench.data.expert_rates import Measurement
+    from clbench.jobs.plan import Plan
     from clbench.spec.scenario import Scenario
     from clbench.spec.task import Task
 
@@ -71,9 +72,10 @@ def demonstrations(
     with checked_input():
         loaded = load_scenario(scenario)
         check_folders({})
-    _collect(scenario, loaded, loaded.tasks, workers)
+    tasks = loaded.tasks + loaded.background
+    _collect(scenario, loaded, tasks, workers)
     console = Console()
-    for task in loaded.tasks:
+    for task in tasks:
         episodes = read_dataset(dataset_folder(task, loaded.budget))
         count = len(episodes)
         facts = (
@@ -160,11 +162,17 @@ def import_(
 def _collect(name: str, scenario: Scenario, tasks: Sequence[Task], workers: int | None) -> None:
     """Collect the demonstrations of tasks that are missing; end with exit code 1 if an expert fails."""
     from clbench.jobs.plan import Plan
-    from clbench.jobs.processes import Processes
-    from clbench.jobs.scheduler import run_with_bars
 
     plan = Plan()
     plan.add_demonstrations(name, scenario, tasks)
+    _do(plan, workers)
+
+
+def _do(plan: Plan, workers: int | None) -> None:
+    """Do the jobs of a plan; end with exit code 1 if one fails."""
+    from clbench.jobs.processes import Processes
+    from clbench.jobs.scheduler import run_with_bars
+
     if run_with_bars(plan.jobs, Processes(workers)):
         sys.exit(1)
 
@@ -176,21 +184,31 @@ def pretrain(
     policy: PolicyName = DEFAULT_POLICY,
     policy_size: PolicySize = SMALL,
     seed: Seed = 0,
+    workers: Annotated[int | None, whole_number(1)] = None,
     ship: Annotated[bool, Parameter(negative="")] = False,
 ) -> None:
     """Pretrain the policy that every method starts from on SCENARIO, unless it is in the cache.
 
-    `clbench run` does the same where a pretrained policy is missing.
+    The command first collects missing demonstrations. `clbench run` does the same where a pretrained policy
+    is missing.
 
     Args:
         scenario: Gymnasium id of the scenario.
         policy: flow, discrete_diffusion, or a class of your own as module:Class.
         policy_size: small, base (5 million parameters) or large (40 million), for built-in policies.
         seed: Seed of the policy.
+        workers: Number of tasks to collect demonstrations of at once (default: all cores).
         ship: Copy the policy to clbench/pretrained/, so that it ships with the package. Needs a checkout.
     """
     from clbench.jobs.bars import Bars
-    from clbench.learning.pretraining import SHIPPED, pretrained_policy, shipped_folder, vision_steps
+    from clbench.jobs.plan import Plan
+    from clbench.learning.pretraining import (
+        SHIPPED,
+        is_pretrained,
+        pretrained_policy,
+        shipped_folder,
+        vision_steps,
+    )
     from clbench.policy.kinds import policy_class
     from clbench.spec.registry import load_scenario
 
@@ -200,6 +218,11 @@ def pretrain(
         if ship and not (SHIPPED.parents[1] / "pyproject.toml").is_file():
             raise InputError("--ship needs a checkout of clbench: it does not change an installed package.")
         policy_class(kind_of(loaded.policy))
+        check_folders({})
+        plan = Plan()
+        if not is_pretrained(loaded, seed):
+            plan.add_pretraining_data(scenario, loaded)
+    _do(plan, workers)
     length = loaded.budget.pretraining_steps + vision_steps(loaded)
     with checked_input(), Bars(length) as bars:  # an expert may fail, the disk may be full
         name = f"{loaded.id} pretraining seed {seed}"

@@ -11,13 +11,14 @@ from clbench.jobs import work
 from clbench.jobs.job import Job, Product
 from clbench.jobs.recorded import has_failed, has_record
 from clbench.learning.pretraining import is_pretrained, vision_steps
+from clbench.policy.kinds import policy_class
 from clbench.records.paths import table_name
 from clbench.runs.length import point_length, run_length, training_length, watching_length
 from clbench.runs.spec import ResolvedRun
 from clbench.runs.start import is_evaluated
 from clbench.spec.identifiers import folder_name, without_module
 from clbench.spec.limits import Limits
-from clbench.spec.policies import DEFAULT_POLICY
+from clbench.spec.policies import DEFAULT_POLICY, kind_of
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 
@@ -144,6 +145,18 @@ class Plan:
         self._runs.append(job)
         return job
 
+    def add_pretraining_data(self, name: str, scenario: Scenario) -> tuple[Job, ...]:
+        """Add jobs that collect all that a policy is pretrained on, and return them.
+
+        Nobody pretrains a class of policies with weights of its own, so it needs no demonstrations.
+
+        Args:
+            name: Id of the scenario, as the user typed it.
+            scenario: The scenario, with its policy.
+        """
+        tasks = () if policy_class(kind_of(scenario.policy)).pretrained else scenario.pretrained
+        return self._question_job(name, scenario), *self.add_demonstrations(name, scenario, tasks)
+
     # ---- needs of runs -----------------------------------------------------------------------------
 
     def _needs(self, run: ResolvedRun) -> tuple[Job, ...]:
@@ -166,10 +179,7 @@ class Plan:
 
     def _pretraining(self, name: str, scenario: Scenario, seed: int) -> Job:
         steps = scenario.budget.pretraining_steps + vision_steps(scenario)
-        needs = (
-            self._question_job(name, scenario),
-            *self.add_demonstrations(name, scenario, scenario.pretrained),
-        )
+        needs = self.add_pretraining_data(name, scenario)
         title = _title(name, f"pretraining seed {seed}", scenario.policy)
         arguments = {"scenario": name, "policy": scenario.policy, "seed": seed}
         return Job(title, work.pretrain, arguments, steps, needs)

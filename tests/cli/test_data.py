@@ -117,7 +117,7 @@ def test_demonstrations_are_exported_after_those_that_are_missing_are_collected(
     assert len(list((empty_caches / "minari").rglob("main_data.hdf5"))) == 2
 
 
-def test_pretraining_after_an_expert_that_fails_ends_with_exit_code_2_and_one_line(
+def test_pretraining_after_an_expert_that_fails_ends_with_exit_code_1_and_names_the_expert(
     write_module: Callable[[str, str], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_module(
@@ -138,8 +138,9 @@ clbench.register("me/Lazy-v0", "lazy_left:SCENARIO")
     )
     with pytest.raises(SystemExit) as ended:
         _clbench("pretrain", "lazy_left:me/Lazy-v0")
-    assert ended.value.code == 2
-    (line,) = (one for one in capsys.readouterr().err.splitlines() if one.startswith("error: "))
+    assert ended.value.code == 1
+    (line,) = (one for one in capsys.readouterr().err.splitlines() if "expert of" in one)
+    assert "demonstrations left: " in line
     assert "The expert of 'left' succeeded 0 times in 20 attempts" in line
 
 

@@ -13,12 +13,14 @@ from clbench.base.errors import UnknownNameError
 from clbench.jobs.job import Job
 from clbench.jobs.plan import Plan
 from clbench.learning.pretraining import pretrained_policy
+from clbench.policy.transformer import TransformerPolicy
 from clbench.records.reader import read_record
 from clbench.records.writer import write_record
 from clbench.runs.length import run_length
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.runs.start import evaluate_pretrained
+from clbench.spec.registry import load_scenario
 
 TOY = "clbench.testing:clbench/Toy-v0"
 
@@ -104,6 +106,24 @@ def test_a_pretraining_is_as_long_as_its_steps(tmp_path: Path, empty_caches: Pat
     plan.add_run(RunSpec(TINY.id, "sft", 0).resolve(), tmp_path)
     (job,) = (job for job in plan.jobs if "pretraining" in job.title)
     assert job.length == TINY.budget.pretraining_steps == 10
+
+
+class Downloaded(TransformerPolicy):
+    """Has pretrained weights of its own."""
+
+    pretrained = True
+
+
+@pytest.mark.parametrize("policy", ["flow", f"{__name__}:Downloaded"])
+def test_only_a_policy_that_is_pretrained_here_needs_the_demonstrations_of_skills_and_background(
+    policy: str,
+) -> None:
+    toy = load_scenario(TOY).with_policy(policy)
+    more = dataclasses.replace(toy.retained[0], name="more")
+    scenario = dataclasses.replace(toy, background=(more,))
+    titles = [job.title for job in Plan().add_pretraining_data(TOY, scenario)]
+    tasks = (*toy.retained, more) if policy == "flow" else ()
+    assert titles == ["Toy-v0 questions", *(f"Toy-v0 demonstrations {task.name}" for task in tasks)]
 
 
 def test_no_two_jobs_of_a_plan_have_one_title_with_a_policy_of_a_class(
