@@ -4,6 +4,7 @@ import contextlib
 import os
 import re
 import shutil
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -36,7 +37,7 @@ def served_by(program: str, folder: Path) -> Iterator[str]:
     """Run a program of the page on a free port, and yield the address that it prints."""
     shutil.copy(SERVER, folder / "server.py")
     (folder / "serve_policy.py").write_text(program.replace("port=8000", "port=0"), encoding="utf-8")
-    command = [sys.executable, "serve_policy.py"]
+    command = [sys.executable, "serve_policy.py", "stage-0"]
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as server:
         try:
             assert server.stdout is not None
@@ -66,6 +67,37 @@ def test_the_policy_of_the_page_is_served_and_scored_by_its_commands(
     assert "does it serve the new checkpoint?" in done.stderr
     (kept,) = (path for path in (tmp_path / "leaderboard" / "records").rglob("*") if path.is_file())
     assert kept.name == "seed-0.json.unfinished"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("bash") is None, reason="the script of the page is for bash")
+def test_the_script_of_the_page_scores_all_stages_one_after_another(
+    tmp_path: Path, empty_caches: Path
+) -> None:
+    shutil.copy(SERVER, tmp_path / "server.py")
+    with socket.create_server(("localhost", 0)) as free:
+        port = str(free.getsockname()[1])
+    program = SERVED.replace("8, 4)", "8, 2)").replace("port=8000", f"port={port}")
+    (tmp_path / "serve_policy.py").write_text(program, encoding="utf-8")
+    (script,) = blocks_of(PAGE, "bash")
+    stages = len(load_scenario(ID).target) + 1
+    for shown, here in (
+        ("0 1 2 3 4", " ".join(str(stage) for stage in range(stages))),
+        ("clbench/Fetch-v1", ID),
+        ("localhost:8000", f"localhost:{port}"),
+        ("python ", f"{sys.executable} "),
+        ("clbench score", f"{sys.executable} -m clbench score"),
+    ):
+        assert shown in script
+        script = script.replace(shown, here)
+    done = subprocess.run(
+        ["bash", "-c", script], cwd=tmp_path, check=False, capture_output=True, text=True, timeout=280
+    )
+    for stage in range(stages):
+        assert f"(server: checkpoint stage-{stage})" in done.stderr, done.stderr
+    assert (tmp_path / "leaderboard/records/Toy-v0/me--lora/seed-0.json").is_file()
+    with socket.create_server(("localhost", int(port))):  # no server is left
+        pass
 
 
 def test_the_page_lists_the_sizes_of_all_scenarios_that_retain_skills() -> None:
