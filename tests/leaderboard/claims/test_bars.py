@@ -343,6 +343,7 @@ def test_only_a_method_that_certainly_keeps_more_answers_than_plain_fine_tuning_
     assert judged("A3", given).sentences == (
         "lora+rank=4: fewer answers are lost than with sft.",
         "The direction of the update was not measured.",
+        "lora was not tuned here: its learning rate is 3 to 111 times those that tuning chose elsewhere.",
     )
 
 

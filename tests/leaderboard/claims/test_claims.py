@@ -15,7 +15,9 @@ from helpers import sealed
 from clbench.base.entry_points import resolve
 from clbench.records.paths import record_path
 from clbench.records.record import Record
+from clbench.spec.registry import load_scenario
 
+ROOT = Path(__file__).parents[3]
 CLAIMS = resolve("clbench.leaderboard.claims.judges:CLAIMS")
 
 RULES = {
@@ -333,3 +335,18 @@ def test_the_command_is_part_of_the_command_line() -> None:
     app = resolve("clbench.cli.main:app")
     assert app["claims"] is not None
     assert app["method-pages"] is not None
+
+
+@pytest.mark.parametrize(("method", "least", "most"), [("aegis", 61, 202), ("lora", 3, 111)])
+def test_untuned_methods_exceed_the_tuned_rates_of_other_boards_as_the_page_says(
+    method: str, least: int, most: int
+) -> None:
+    times = []
+    for name in ("Fetch-v1", "MetaWorld-v1", "PointMaze-v1"):
+        tuned = json.loads((ROOT / f"methods/tuned/{name}.json").read_text(encoding="utf-8"))
+        factor = tuned["methods"][method]["settings"]["step_factor"]
+        rates = [load_scenario(f"clbench/{one}").budget.learning_rate for one in ("FetchKnowledge-v1", name)]
+        times.append(rates[0] / (factor * rates[1]))
+    assert (round(min(times)), round(max(times))) == (least, most)
+    page = (ROOT / "docs/reference/claims.md").read_text(encoding="utf-8")
+    assert f"its learning rate is {least} to {most} times those that tuning chose elsewhere" in page
