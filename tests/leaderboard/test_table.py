@@ -94,7 +94,7 @@ def test_the_relative_cost_counts_all_steps_with_the_time_of_one(
             add_full(method, seed, edit=measured(steps, ratio))
     costs = load(four_methods).set_index("method").relative_cost
     assert costs["sft"] == 1.0
-    assert costs["slow"] == pytest.approx(1.5 * (1.3 * 1.5) ** 0.5)  # of one step, the geometric mean over seeds
+    assert costs["slow"] == pytest.approx(1.5 * (1.3 * 1.5) ** 0.5)  # the geometric mean of the times
     assert costs["idle"] == 0.0
     assert np.isnan(costs["unknown"])
     assert np.isnan(costs["torn"])
