@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from clbench.base.cache import CacheError, cached, hash_of_tensors, is_cached
+from clbench.base.lease import LeaseLostError, lease_path
 
 INPUTS = {"seed": 0}
 
@@ -133,3 +134,13 @@ def test_the_hash_of_tensors_tells_names_shapes_types_and_bits_apart() -> None:
     hashes = [hash_of_tensors(one) for one in ({"a": value}, *others)]
     assert len(set(hashes)) == len(hashes)
     assert hash_of_tensors({"a": torch.tensor([[1.0, 2.0], [-0.0, 3.0]]).T[0]}) == hashes[0]
+
+
+def test_what_was_made_without_the_lease_is_not_kept(tmp_path: Path) -> None:
+    def make(folder: Path) -> None:
+        (folder / "value.txt").write_text("mine")
+        lease_path(tmp_path / "x").unlink()
+
+    with pytest.raises(LeaseLostError):
+        cached(tmp_path / "x", {}, make)
+    assert not (tmp_path / "x").exists()

@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import ClassVar
 
@@ -14,6 +14,9 @@ from clbench.learning.method import Method, Progress
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
 from clbench.records.reader import read_record
+from clbench.records.record import Record
+from clbench.records.writer import write_record
+from clbench.runs.spec import ResolvedRun
 
 TINY = "tiny:me/Tiny-v0"
 
@@ -159,3 +162,33 @@ def test_a_setting_that_fails_is_not_chosen_and_a_method_that_always_fails_stops
     assert methods[names[0]]["settings"]["step_factor"] < 1.0
     assert len(tried) == 6
     assert "failed" in said.out
+
+
+def test_the_best_mean_over_the_seeds_is_refined_and_chosen(
+    make_record: Callable[..., Record], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = {(1.0, 0.3): (0.9, 0.0), (0.3, 0.3): (0.5, 0.7), (0.1, 0.3): (0.5, 0.5), (0.03, 0.3): (0.2, 0.2)}
+    kept |= {(0.3, 0.1): (0.4, 0.4), (0.3, 1.0): (0.7, 0.9)}
+    asked = []
+
+    def do_runs(runs: Iterable[ResolvedRun], records: Path, workers: object) -> bool:
+        for run in runs:
+            settings = run.info.settings["step_factor"], run.info.settings["strength"]
+            asked.append((*settings, run.spec.seed))
+            rate = kept.get(settings, (0.1, 0.1))[run.spec.seed - 100]
+            success = [[1, 1, 0, 0, 0], [1, 1, 0.9, 0, 0], [rate, rate, rate, 0.9, 0]]
+            record = make_record(success, steps=(100,), episodes=10, split="validation", seed=run.spec.seed)
+            write_record(record, run.path(records))
+        return True
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(".")
+    monkeypatch.setattr("clbench.cli.tune.do_runs", do_runs)
+    options = ("--seeds", "2", "--write", "tuned.json")
+    app(["tune", "tiny:me/Tiny-v0", "l2_sp", *options], result_action="return_value")
+    found = json.loads((tmp_path / "tuned.json").read_text(encoding="utf-8"))["methods"]["l2_sp"]
+    assert asked == [(*one, seed) for one in kept for seed in (100, 101)]
+    finals = [(3 * sum(rates) / 2 + 0.9) / 4 for rates in kept.values()]
+    assert [one["final_average"] for one in found["tried"]] == pytest.approx(finals, abs=1e-4)
+    assert {one["learned"] for one in found["tried"]} == {0.9}
+    assert found["settings"] == {"strength": 1.0, "step_factor": 0.3}

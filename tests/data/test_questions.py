@@ -7,6 +7,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from clbench.data.demonstrations import dataset_id
 from clbench.data.questions import (
     QuestionKind,
     Questions,
@@ -99,3 +100,24 @@ def test_fetch_questions_have_balanced_answers_for_training_and_test() -> None:
             for answer in entry.answers:
                 share = float((batch.answer[kind == index] == word_id(answer)).float().mean())
                 assert share == pytest.approx(1 / len(entry.answers), abs=0.2)
+
+
+TOY_SCENARIO = load_scenario("clbench.testing:clbench/Toy-v0")
+
+
+def test_the_scored_questions_stay_those_of_the_published_records() -> None:
+    _, asked = scored_questions(load_questions(TOY_SCENARIO)[1], 12)
+    assert asked.answer.tolist() == [266, 3, 408, 50, 408, 50, 408, 3, 408, 50, 266, 3]
+
+
+@pytest.mark.parametrize("name", ["source_hash", "simulator_versions"])
+def test_scenes_and_demonstrations_of_other_code_or_versions_are_made_anew(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left, budget = TOY_SCENARIO.task("left"), TOY_SCENARIO.budget
+    before = dataset_id(left, budget), scenes_folder(TOY_SCENARIO)
+    for module in ("demonstrations", "questions"):
+        monkeypatch.setattr(f"clbench.data.{module}.{name}", lambda *_: {"other": "1"})
+    after = dataset_id(left, budget), scenes_folder(TOY_SCENARIO)
+    assert before[0] != after[0]
+    assert before[1] != after[1]

@@ -204,3 +204,28 @@ def test_vector_and_merged_weights_survive_the_state() -> None:
     first, second = (_regulariser_gradient(each, policy) for each in (method, other))
     assert first.keys() == second.keys()
     assert all(value.equal(second[name]) for name, value in first.items())
+
+
+@pytest.mark.usefixtures("empty_caches")
+@pytest.mark.parametrize(
+    ("name", "other"),
+    [("arithmetic", lambda _: {"maker": "another"}), ("source_hash", lambda *_: "newer")],
+)
+def test_the_vector_is_made_anew_for_other_arithmetic_and_other_code(
+    name: str, other: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = importlib.import_module(load_method("fast_dvla").__module__)
+
+    def prepare() -> None:
+        prior = Prior({"demonstrations": toy_source("left", "up"), "questions": toy_questions()})
+        build_method("fast_dvla", {"steps": 2}).prepare(TransformerPolicy(SMALL, seed=5), prior)
+
+    def fail(*_: object) -> NoReturn:
+        raise AssertionError("made a second time")
+
+    prepare()
+    monkeypatch.setattr(module, "optimise", fail)
+    prepare()
+    monkeypatch.setattr(module, name, other)
+    with pytest.raises(AssertionError, match="made a second time"):
+        prepare()

@@ -226,3 +226,11 @@ def test_a_record_may_be_indented_and_its_settings_reordered(record: Record, tmp
     values["run"]["settings"] = dict(reversed(values["run"]["settings"].items()))
     path.write_text(json.dumps(values, indent=4, ensure_ascii=False), encoding="utf-8")
     assert read_record(path) == record
+
+
+def test_success_at_the_start_counts_the_scored_episodes_of_the_retained_skills_alone(
+    make_record: Callable[..., Record],
+) -> None:
+    success = [[1.0, 0.8, 0.1, 0.0, 0.2], [0.6, 0.9, 0.9, 0.2, 0.3], [0.5, 0.4, 0.3, 0.8, 0.1]]
+    record = make_record(success, perturbed=[[0.1, 0.1], [0.5, 0.8], [0.4, 0.2]], complete=False)
+    assert record.retained_at_start() == pytest.approx((1.0 + 0.8) / 2)

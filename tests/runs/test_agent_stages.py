@@ -14,6 +14,7 @@ from agents import ID, LEARNED, Knowing, stage_env
 
 import clbench
 from clbench.base.errors import InputError
+from clbench.base.lease import LeaseLostError
 from clbench.cli.status import found_runs
 from clbench.evaluation.definition import definition
 from clbench.records.reader import read_record
@@ -208,3 +209,16 @@ def test_a_program_that_was_refused_a_stage_does_not_keep_the_run(
     with pytest.raises(InputError, match="comes next, not 1"):
         evaluate(Knowing(), stage_env(1), records=empty_caches / "records")
     subprocess.run([sys.executable, "-c", BEGINS.format(id=ID)], cwd=empty_caches, check=True)
+
+
+def test_a_stage_of_a_process_that_lost_its_lease_is_not_kept(
+    evaluate: Callable[..., Any], tmp_path: Path
+) -> None:
+    def act(observation: object) -> list[int]:
+        for lease in (tmp_path / "records").rglob(".*.lease"):
+            lease.unlink()
+        return [0, 0]
+
+    with pytest.raises(LeaseLostError):
+        evaluate(act, stage_env(0))
+    assert not list((tmp_path / "records").rglob("*.unfinished"))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar
@@ -80,3 +81,33 @@ def test_a_run_goes_on_only_where_the_processor_computes_like_the_first_one(
     record = execute(spec, tmp_path)
     assert record.status == "success"
     assert ("resumed_after" in record.timing) == resumed
+
+
+SOURCE = """
+import dataclasses
+import clbench
+
+@dataclasses.dataclass
+class Mine(clbench.Method):
+    def loss(self, policy, batch, progress):
+        return {factor} * policy.action_loss(batch).mean()
+"""
+
+
+@pytest.mark.parametrize("changed", ["method", "clbench"])
+def test_a_run_does_not_go_on_from_a_stage_of_other_code(
+    changed: str,
+    tmp_path: Path,
+    write_module: Callable[[str, str], None],
+    execute_and_kill: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    write_module("typed_mine", SOURCE.format(factor=1))
+    spec = RunSpec(TINY.id, "typed_mine:Mine", 0)
+    execute_and_kill(spec, tmp_path, 0.75)
+    if changed == "method":
+        write_module("typed_mine", SOURCE.format(factor=2.5))
+        monkeypatch.delitem(sys.modules, "typed_mine")
+    else:
+        monkeypatch.setattr("clbench.learning.trainer.source_hash", lambda *_: "newer")
+    assert "resumed_after" not in execute(spec, tmp_path).timing

@@ -13,6 +13,7 @@ import torch
 from eager import EAGER
 from helpers import stage_policies
 
+from clbench.base.cache import CacheError
 from clbench.base.progress import no_progress
 from clbench.base.seeding import torch_generator
 from clbench.data.training_data import TrainingData
@@ -262,3 +263,14 @@ def test_a_scenario_of_equal_stages_has_a_shift_at_their_ends_and_no_relearning(
     assert record.relearning is None
     shifts = zip(record.policy["stage"], record.policy["step"], record.policy["shift"], strict=True)
     assert [(stage, step) for stage, step, shift in shifts if shift is not None] == [(1, 60), (2, 60)]
+
+
+def test_a_failure_of_the_machine_in_relearning_is_not_one_of_the_method() -> None:
+    def check(*_: object) -> None:
+        raise CacheError("the disk failed")
+
+    trainer = Trainer.open(EAGER, load_method("sft"), 0, "cpu")
+    examiner: Any = SimpleNamespace(successes=lambda policy: {"left": 3, "up": 1})
+    checker: Any = SimpleNamespace(is_due=lambda point: True, check=check, is_learned=lambda row: True)
+    with pytest.raises(CacheError):
+        relearn(trainer, examiner, checker, no_progress)

@@ -1,5 +1,6 @@
 """Scores: the values in a record, and no others."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -430,4 +431,12 @@ def test_a_budget_of_fewer_than_no_episodes_is_refused(name: str, make_record: M
     record = make_record(MATRIX)
     record.scenario.budget[name] = -1
     with pytest.raises(RecordError, match=f"{name} of its budget must be a whole number, not -1"):
+        Scores.from_record(record, partial=True)
+
+
+def test_a_record_counts_the_steps_of_its_preparation(make_record: MakeRecord) -> None:
+    success = [[1, 0.8, 0.1, 0, 0.2], [0.6, 0.9, 0.9, 0.2, 0.3], [0.5, 0.4, 0.3, 0.8, 0.1]]
+    record = make_record(success, steps=(100,), ends=(8, 12))
+    record.costs = dataclasses.replace(record.costs, optimiser_steps=20, preparation_steps=300)
+    with pytest.raises(RecordError, match="20 optimiser steps are fewer than the 320 of the preparation"):
         Scores.from_record(record, partial=True)

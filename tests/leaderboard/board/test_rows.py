@@ -321,3 +321,17 @@ def test_runs_that_began_with_another_pretrained_policy_than_plain_fine_tuning_a
     others = row("mine:Mine", s0="a", s1="c", s2="d"), row("lora", s0="a", s1="b")
     assert unpaired([sft, *others, row("them", "external", s0="z")]) == {"mine:Mine": [1]}
     assert unpaired(others) == {}
+
+
+def test_a_relative_cost_takes_steps_and_times_of_the_seeds_that_both_methods_have(
+    even_board: Callable[..., Path],
+) -> None:
+    for seed in range(2):
+        records = even_board("sft", seed, 0.5)
+    for seed in (1, 2):
+        even_board("lora", seed, 0.5)
+    runs = {row.method: row.runs for row in compute_board(records).rows}
+    figures = zip((*runs["sft"], *runs["lora"]), (10, 40, 20, 80), (1, 1, 3.0, 9.0), strict=True)
+    for run, steps, ratio in figures:
+        run.record.costs.optimiser_steps, run.record.timing["step_ratio"] = steps, ratio
+    assert costs_of(runs["lora"], runs["sft"])["relative_cost"] == pytest.approx(20 / 40 * 3.0)

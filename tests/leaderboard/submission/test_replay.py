@@ -266,3 +266,35 @@ def test_the_worlds_are_closed_if_a_replay_fails(
     with pytest.raises(RuntimeError, match="the simulator crashed"):
         verify(mine, "replayed", honest)
     assert len(closed) == 1
+
+
+def test_the_stage_that_is_trained_again_is_drawn_with_the_seed_of_the_verifier(
+    mine: Path, honest: Path
+) -> None:
+    stages = set()
+    for seed in range(3):
+        checks = verify(mine, "replayed", honest, episodes=1, seed=seed)
+        (check,) = (one for one in checks if one.name == "from stage to stage")
+        stages.add(check.found.split()[1])
+    assert stages == {"1", "2"}
+
+
+def test_a_policy_that_is_off_by_a_tenth_of_its_way_is_refused(
+    mine: Path, honest: Path, tmp_path: Path
+) -> None:
+    for stage in (honest / "checkpoints").rglob("stage-*"):
+        inputs = json.loads((stage / MANIFEST).read_text(encoding="utf-8"))["made_from"]
+
+        def write(folder: Path, stage: Path = stage) -> None:
+            shutil.copytree(stage, folder, dirs_exist_ok=True)
+            if stage.name == "stage-2":
+                names = ("stage-1", "stage-2")
+                before, after = (load_file(stage.with_name(one) / "policy.safetensors") for one in names)
+                off = {name: value + 0.1 * (value - before[name]) for name, value in after.items()}
+                save_file(off, folder / "policy.safetensors")
+
+        place = tmp_path / "off" / stage.relative_to(honest)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        cached(place, inputs, write)
+    checks = verify(mine, "replayed", tmp_path / "off", episodes=1, seed=0)
+    assert {one.name: one.passed for one in checks}["from stage to stage"] is False
