@@ -53,6 +53,13 @@ def test_every_link_of_a_document_leads_to_a_file_and_a_heading(page: Path) -> N
     assert broken == []
 
 
+@pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_every_link_by_a_name_has_a_line_that_defines_it(page: Path) -> None:
+    plain = re.sub(r"```.*?```|`[^`]*`", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    defined = re.findall(r"^\[([^\]]+)\]: \S+$", plain, flags=re.MULTILINE)
+    assert set(re.findall(r"\[[^\[\]]+\]\[([^\[\]]{2,})\]", plain)) == set(defined)
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_that_a_guide_shows_is_taken_by_the_command_line(command: str) -> None:
     app.parse_args(shlex.split(command, comments=True)[1:], exit_on_error=False, print_error=False)
