@@ -224,7 +224,7 @@ def pretrain(
             plan.add_pretraining_data(scenario, loaded)
     _do(plan, workers)
     length = loaded.budget.pretraining_steps + vision_steps(loaded)
-    with checked_input(), Bars(length) as bars:  # an expert may fail, the disk may be full
+    with checked_input(), Bars(length) as bars:  # the disk may be full
         name = f"{loaded.id} pretraining seed {seed}"
         bars.start(name, length)
         _, folder = pretrained_policy(loaded, seed, lambda steps: bars.advance(name, steps))

@@ -102,11 +102,8 @@ def test_fetch_questions_have_balanced_answers_for_training_and_test() -> None:
                 assert share == pytest.approx(1 / len(entry.answers), abs=0.2)
 
 
-TOY_SCENARIO = load_scenario("clbench.testing:clbench/Toy-v0")
-
-
 def test_the_scored_questions_stay_those_of_the_published_records() -> None:
-    _, asked = scored_questions(load_questions(TOY_SCENARIO)[1], 12)
+    _, asked = scored_questions(load_questions(TOY)[1], 12)
     assert asked.answer.tolist() == [266, 3, 408, 50, 408, 50, 408, 3, 408, 50, 266, 3]
 
 
@@ -114,10 +111,10 @@ def test_the_scored_questions_stay_those_of_the_published_records() -> None:
 def test_scenes_and_demonstrations_of_other_code_or_versions_are_made_anew(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    left, budget = TOY_SCENARIO.task("left"), TOY_SCENARIO.budget
-    before = dataset_id(left, budget), scenes_folder(TOY_SCENARIO)
+    left, budget = TOY.task("left"), TOY.budget
+    before = dataset_id(left, budget), scenes_folder(TOY)
     for module in ("demonstrations", "questions"):
         monkeypatch.setattr(f"clbench.data.{module}.{name}", lambda *_: {"other": "1"})
-    after = dataset_id(left, budget), scenes_folder(TOY_SCENARIO)
+    after = dataset_id(left, budget), scenes_folder(TOY)
     assert before[0] != after[0]
     assert before[1] != after[1]

@@ -258,6 +258,6 @@ def test_actions_that_numpy_cannot_hold_are_refused_in_words_of_the_policy(
 
 
 def test_the_episodes_of_a_split_stay_those_of_the_published_records() -> None:
-    left = load_scenario("clbench.testing:clbench/Toy-v0").task("left")
+    left = TOY.task("left")
     assert start_of(Trial(left, "test", 3), 5) == (1785073415, "move to the left")
     assert start_of(Trial(left, "validation", 3), 5) == (370372521, "move to the left")
