@@ -7,6 +7,7 @@ import pytest
 
 from clbench.base.entry_points import resolve
 from clbench.records.paths import label_of, record_path
+from clbench.records.reader import read_record
 from clbench.records.record import Record
 from clbench.records.writer import write_record
 from clbench.runs.tuning import Tried, Tuned
@@ -101,6 +102,23 @@ def test_one_learning_rate_is_no_ladder(even_board: Callable[..., Path]) -> None
     even_board("finch", 0, 0.2, "ladder", step_factor=0.3)
     even_board("sft", 0, 0.2, "ladder", step_factor=0.3)
     assert not compute_board(even_board("sft", 0, 0.1)).frontiers
+
+
+def test_a_ladder_of_another_simulator_has_no_curve_and_the_board_says_why(
+    even_board: Callable[..., Path],
+) -> None:
+    records = even_board("sft", 0, 0.1)
+    for factor in (1.0, 0.3):
+        even_board("finch", 0, 0.2, "ladder", step_factor=factor)
+    for path in (records.parent / "ladder").rglob("seed-*.json"):
+        record = read_record(path)
+        record.fingerprint["rollouts"] = {"clbench.testing:ToyWorld": "another"}
+        write_record(record, path)
+    board = compute_board(records)
+    assert not board.frontiers
+    assert [one.reason for one in board.not_shown] == [
+        "its simulator does not match that of the board's records."
+    ] * 2
 
 
 def test_a_rung_has_what_was_learned_in_each_stage_and_what_is_kept_of_skills_and_earlier_targets(
