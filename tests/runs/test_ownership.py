@@ -131,6 +131,24 @@ def test_a_run_that_another_process_took_over_writes_nothing_more(
 
 
 @dataclasses.dataclass
+class _StartsLate(Method):
+    """A method whose run another process takes over, and begins, before this one begins."""
+
+    def __post_init__(self) -> None:
+        for lease in (cache_folder() / "runs").glob(".*.lease"):
+            lease.unlink()
+            (lease.parent / lease.name[1:].removesuffix(".lease") / "stage-1").mkdir(parents=True)
+
+
+def test_a_run_that_another_process_took_over_before_it_began_leaves_the_stages_there(
+    tmp_path: Path, empty_caches: Path, stranger: Callable[[type[Method]], str]
+) -> None:
+    with pytest.raises(LeaseLostError, match="was lost to another process"):
+        execute(RunSpec(TINY.id, stranger(_StartsLate), seed=0), tmp_path)
+    assert [path.name for path in cache_folder().glob("runs/*/stage-*")] == ["stage-1"]
+
+
+@dataclasses.dataclass
 class _Exits(Method):
     """A method that wants to end the process."""
 
