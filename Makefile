@@ -81,7 +81,7 @@ records: .venv/installed-libero
 	$(BIN)/clbench run clbench/LiberoSpatial-v1 experience_replay from_scratch frozen joint sft --seeds 4
 	$(BIN)/clbench run clbench/Fetch-v1 frozen sft consft aegis experience_replay lora stop_gradient --seeds 3 \
 		--policy discrete_diffusion
-	$(BIN)/clbench run clbench/Fetch-v1 sft experience_replay lora --seeds 1 --policy-size base
+	$(BIN)/clbench run clbench/Fetch-v1 sft experience_replay lora --seeds 1 --policy flow-base
 	$(BIN)/clbench run $(FIXED),clbench/MetaWorldCW-v0 sft frozen joint from_scratch --seeds 3
 	$(BIN)/clbench run $(FIXED) experience_replay --seeds 3
 	$(BIN)/python docs/guide/online_sac.py clbench/PointMaze-v1 --seeds 3

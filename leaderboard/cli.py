@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import Parameter
 from rich.console import Console
 
 from clbench.base.entry_points import unknown
@@ -220,8 +219,8 @@ def verify(
     policy: PolicyName | None = None,
     scenario: ScenarioId | None = None,
     checkpoints: Path | None = None,
-    pretrain: Annotated[bool, Parameter(negative="")] = False,
-    any_processor: Annotated[bool, Parameter(negative="")] = False,
+    pretrain: bool = False,
+    any_processor: bool = False,
     by: str | None = None,
     workers: Annotated[int | None, whole_number(1)] = None,
     records: Path = RECORDS,

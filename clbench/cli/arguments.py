@@ -27,7 +27,7 @@ from rich.text import Text
 from clbench.base.entry_points import unknown
 from clbench.base.errors import ClbenchError, InputError
 from clbench.base.text import printable
-from clbench.spec.policies import SIZES, policy_names
+from clbench.spec.policies import policy_names
 from clbench.spec.protocol import LARGEST_SEED, MOST_SEEDS
 
 
@@ -73,10 +73,6 @@ def _known_policies(_: object) -> tuple[str, ...]:
     return tuple(policy_names())
 
 
-def _known_sizes(_: object) -> tuple[str, ...]:
-    return tuple(SIZES)
-
-
 ScenarioId = Annotated[str, Parameter(completer=_known_scenarios)]
 """Gymnasium id of a scenario on the command line."""
 MethodName = Annotated[str, Parameter(completer=_known_methods)]
@@ -85,10 +81,7 @@ MethodName = Annotated[str, Parameter(completer=_known_methods)]
 PolicyName = Annotated[str, Parameter(completer=_known_policies)]
 """Name of a policy on the command line."""
 
-PolicySize = Annotated[str, Parameter(completer=_known_sizes)]
-"""Size of a policy on the command line."""
-
-AsJson = Annotated[bool, Parameter(name="--json", negative="")]
+AsJson = Annotated[bool, Parameter(name="--json")]
 """Switch of a command that can print JSON instead of tables."""
 
 

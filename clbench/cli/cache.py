@@ -16,7 +16,6 @@ from pathlib import Path
 from stat import S_ISDIR
 from typing import Annotated, Any
 
-from cyclopts import Parameter
 from rich.console import Console
 from rich.table import Table
 from safetensors import SafetensorError, safe_open
@@ -63,8 +62,8 @@ _DAY = 24 * 60 * 60
 
 def cache(
     *,
-    prune: Annotated[bool, Parameter(negative="")] = False,
-    dry_run: Annotated[bool, Parameter(negative="")] = False,
+    prune: bool = False,
+    dry_run: bool = False,
     older_than: Annotated[int, whole_number(0)] = 30,
 ) -> None:
     """Show what the cache and the Minari datasets of clbench hold, and which entries are stale.

@@ -26,7 +26,7 @@ from clbench.records.tables import GROUPS
 if TYPE_CHECKING:
     from packaging.requirements import Requirement
 
-TaskNames = Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="", show_default=False)]
+TaskNames = Annotated[tuple[str, ...], Parameter(consume_multiple=True, show_default=False)]
 """Names of tasks on the command line, one or more after one option."""
 
 

@@ -19,7 +19,6 @@ from clbench.base.errors import InputError
 from clbench.base.text import counted, print_plain
 from clbench.cli.arguments import (
     PolicyName,
-    PolicySize,
     ScenarioId,
     Seed,
     add_cwd_to_path,
@@ -27,7 +26,7 @@ from clbench.cli.arguments import (
     whole_number,
 )
 from clbench.jobs.folders import check_folders
-from clbench.spec.policies import DEFAULT_POLICY, SMALL, kind_of, policy_name
+from clbench.spec.policies import DEFAULT_POLICY, kind_of
 
 if TYPE_CHECKING:
     from clbench.data.expert_rates import Measurement
@@ -95,7 +94,7 @@ def export(
     *tasks: str,
     format: Literal["lerobot", "hdf5"],  # noqa: A002 - the word that everyone uses
     output: Path,
-    noisy: bool = True,
+    noisy: Annotated[bool, Parameter(negative="--no-noisy")] = True,
     workers: Annotated[int | None, whole_number(1)] = None,
 ) -> None:
     """Export the demonstrations of SCENARIO, or of TASKS alone, for other libraries.
@@ -134,7 +133,7 @@ def import_(
     path: Path,
     /,
     *,
-    state: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = ("states",),
+    state: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = ("states",),
 ) -> None:
     """Import recorded demonstrations from the HDF5 file PATH for TASK of your own SCENARIO.
 
@@ -182,10 +181,9 @@ def pretrain(
     /,
     *,
     policy: PolicyName = DEFAULT_POLICY,
-    policy_size: PolicySize = SMALL,
     seed: Seed = 0,
     workers: Annotated[int | None, whole_number(1)] = None,
-    ship: Annotated[bool, Parameter(negative="")] = False,
+    ship: bool = False,
 ) -> None:
     """Pretrain the policy that every method starts from on SCENARIO, unless it is in the cache.
 
@@ -194,8 +192,8 @@ def pretrain(
 
     Args:
         scenario: Gymnasium id of the scenario.
-        policy: flow, discrete_diffusion, or a class of your own as module:Class.
-        policy_size: small, base (5 million parameters) or large (40 million), for built-in policies.
+        policy: flow or discrete_diffusion, larger ones as flow-base (5 million parameters) or flow-large (40
+            million), or a class of your own as module:Class.
         seed: Seed of the policy.
         workers: Number of tasks to collect demonstrations of at once (default: all cores).
         ship: Copy the policy to clbench/pretrained/, so that it ships with the package. Needs a checkout.
@@ -214,7 +212,7 @@ def pretrain(
 
     add_cwd_to_path()
     with checked_input():
-        loaded = load_scenario(scenario).with_policy(policy_name(policy, policy_size))
+        loaded = load_scenario(scenario).with_policy(policy)
         if ship and not (SHIPPED.parents[1] / "pyproject.toml").is_file():
             raise InputError("--ship needs a checkout of clbench: it does not change an installed package.")
         policy_class(kind_of(loaded.policy))

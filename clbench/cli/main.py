@@ -7,7 +7,7 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cyclopts import App, Group
+from cyclopts import App, Group, Parameter
 from rich.console import Console
 from rich.logging import RichHandler
 
@@ -130,6 +130,7 @@ def _app(name: str, text: str | None, commands: dict[Group, dict[str, str]]) -> 
         error_console=Console(stderr=True, soft_wrap=True),
         error_formatter=parsing_error,
         config=read_paths,
+        default_parameter=Parameter(negative=""),  # an option that is off needs no --no-option
         suppress_keyboard_interrupt=False,  # `clbench.cli.entry` reports it
     )
     for group, members in commands.items():

@@ -19,7 +19,6 @@ from clbench.base.text import counted, print_plain, printable_lines
 from clbench.cli.arguments import (
     MethodName,
     PolicyName,
-    PolicySize,
     ScenarioId,
     Seed,
     Seeds,
@@ -32,7 +31,7 @@ from clbench.cli.arguments import (
 )
 from clbench.jobs.folders import check_folders
 from clbench.records.paths import RECORDS, record_path
-from clbench.spec.policies import DEFAULT_POLICY, SMALL, policy_name
+from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.protocol import DEFAULT_SEEDS
 
 if TYPE_CHECKING:
@@ -47,13 +46,12 @@ def run(
     scenarios: ScenarioId,
     /,
     *methods: MethodName,
-    every: Annotated[bool, Parameter(name="--all", negative="")] = False,
+    every: Annotated[bool, Parameter(name="--all")] = False,
     seeds: Seeds = DEFAULT_SEEDS,
     first_seed: Seed = 0,
     order: Seed = 0,
     policy: PolicyName = DEFAULT_POLICY,
-    policy_size: PolicySize = SMALL,
-    perturb: Annotated[bool, Parameter(negative="")] = False,
+    perturb: bool = False,
     workers: Annotated[int | None, whole_number(1)] = None,
     shard: str = "1/1",
     ray: str | None = None,
@@ -62,8 +60,8 @@ def run(
     changes: Annotated[dict[str, str] | None, Parameter(name="--set")] = None,
     checkpoints: Path | None = None,
     tensorboard: Path | None = None,
-    dry_run: Annotated[bool, Parameter(negative="")] = False,
-    quiet: Annotated[bool, Parameter(name=("--quiet", "-q"), negative="")] = False,
+    dry_run: bool = False,
+    quiet: Annotated[bool, Parameter(name=("--quiet", "-q"))] = False,
 ) -> None:
     """Run METHODS on SCENARIOS, once per seed, and write a record of each run.
 
@@ -80,9 +78,8 @@ def run(
         order: Order of the targets, for scenarios with one published order: 0 is that order, other numbers
             are permutations. The leaderboard uses them to report how much scores depend on the order.
             Scenarios with a separate order for each seed, such as Fetch-v1, accept only 0.
-        policy: flow, discrete_diffusion, or a class of your own as module:Class. Each policy
-            has separate rows.
-        policy_size: small, base (5 million parameters) or large (40 million), for built-in policies.
+        policy: flow or discrete_diffusion, larger ones as flow-base (5 million parameters) or flow-large (40
+            million), or a class of your own as module:Class. Each policy has separate rows.
         perturb: Also evaluate the skills and each new target in perturbed worlds: other start poses, heavier
             or lighter objects and, in pictures, another camera and light. Such a record replaces a record
             without perturbed episodes, as it holds the same episodes and more.
@@ -117,8 +114,7 @@ def run(
             check_device(device)
         if tensorboard:
             require_tensorboard()
-        name = policy_name(policy, policy_size)
-        spec = RunSpec("", "", first_seed, changes or {}, device, order=order, perturb=perturb, policy=name)
+        spec = RunSpec("", "", first_seed, changes or {}, device, order=order, perturb=perturb, policy=policy)
         runs = requested(scenarios, methods, every, seeds, spec, records)
         chosen = _part(shard, runs)
         check_folders({"--records": records, "--checkpoints": checkpoints, "--tensorboard": tensorboard})
@@ -155,7 +151,7 @@ def score(
     pictures: str | None = None,
     picture_size: Annotated[int | None, whole_number(1)] = None,
     timeout: Annotated[int, whole_number(1)] = 300,
-    restart: Annotated[bool, Parameter(negative="")] = False,
+    restart: bool = False,
     records: Path = RECORDS,
 ) -> None:
     """Score a served policy on SCENARIO, after each stage of its fine-tuning in another program.

@@ -20,7 +20,6 @@ from clbench.cli.arguments import (
     AsJson,
     MethodName,
     PolicyName,
-    PolicySize,
     ScenarioId,
     Seed,
     Seeds,
@@ -33,7 +32,7 @@ from clbench.cli.runs import requested
 from clbench.records.paths import RECORDS
 from clbench.records.reader import RecordError, UnreadableRecordError, check_home, read_record
 from clbench.spec.identifiers import check_known
-from clbench.spec.policies import DEFAULT_POLICY, SMALL, policy_name
+from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.protocol import DEFAULT_SEEDS
 
 if TYPE_CHECKING:
@@ -46,7 +45,6 @@ NOT_GIVEN: Mapping[str, object] = {
     "--first-seed": 0,
     "--order": 0,
     "--policy": DEFAULT_POLICY,
-    "--policy-size": SMALL,
 }
 """Values of the options that choose among the runs of a scenario, where nobody gave them."""
 
@@ -87,12 +85,11 @@ def status(
     scenarios: ScenarioId | None = None,
     /,
     *methods: MethodName,
-    every: Annotated[bool, Parameter(name="--all", negative="")] = False,
+    every: Annotated[bool, Parameter(name="--all")] = False,
     seeds: Seeds = DEFAULT_SEEDS,
     first_seed: Seed = 0,
     order: Seed = 0,
     policy: PolicyName = DEFAULT_POLICY,
-    policy_size: PolicySize = SMALL,
     records: Path = RECORDS,
     changes: Annotated[dict[str, str] | None, Parameter(name="--set")] = None,
     as_json: AsJson = False,
@@ -110,8 +107,8 @@ def status(
         seeds: Number of seeds.
         first_seed: The first seed.
         order: Order of the targets, as for `clbench run`.
-        policy: flow, discrete_diffusion, or a class of your own as module:Class.
-        policy_size: small, base or large.
+        policy: flow or discrete_diffusion, larger ones as flow-base (5 million parameters) or flow-large (40
+            million), or a class of your own as module:Class.
         records: Folder of the records.
         changes: Hyper-parameters that differ from those tuned for the scenario or, without tuning, from the
             method's defaults, as --set.name value.
@@ -120,7 +117,7 @@ def status(
     add_cwd_to_path()
     with checked_input():
         if scenarios is None:
-            values = (every, seeds, first_seed, order, policy, policy_size)
+            values = (every, seeds, first_seed, order, policy)
             options = zip(NOT_GIVEN, values, strict=True)
             given = [name for name, value in options if value != NOT_GIVEN[name]]
             given += [f"--set.{name}" for name in changes or {}]
@@ -135,8 +132,7 @@ def status(
             check_known(items_of("SCENARIOS", scenarios), methods)
             from clbench.runs.spec import RunSpec
 
-            name = policy_name(policy, policy_size)
-            spec = RunSpec("", "", first_seed, changes or {}, order=order, policy=name)
+            spec = RunSpec("", "", first_seed, changes or {}, order=order, policy=policy)
             runs = requested(scenarios, methods, every, seeds, spec, records)
             states = [run_state(run.path(records), run) for run in runs]
     if as_json:

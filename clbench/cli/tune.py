@@ -18,7 +18,6 @@ from clbench.base.text import counted, print_plain
 from clbench.cli.arguments import (
     MethodName,
     PolicyName,
-    PolicySize,
     ScenarioId,
     Seed,
     Seeds,
@@ -33,7 +32,7 @@ from clbench.cli.runs import do_runs
 from clbench.jobs.folders import check_folders
 from clbench.records.paths import TUNING, table_name
 from clbench.spec.identifiers import without_module
-from clbench.spec.policies import DEFAULT_POLICY, SMALL, policy_name
+from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.protocol import FIRST_TUNING_SEED
 from clbench.spec.references import BASELINE
 
@@ -47,7 +46,7 @@ def tune(
     scenario: ScenarioId,
     /,
     *methods: MethodName,
-    every: Annotated[bool, Parameter(name="--all", negative="")] = False,
+    every: Annotated[bool, Parameter(name="--all")] = False,
     seeds: Seeds = 2,
     first_seed: Seed = FIRST_TUNING_SEED,
     fixed: Annotated[dict[str, str] | None, Parameter(name="--set")] = None,
@@ -56,7 +55,6 @@ def tune(
     workers: Annotated[int | None, whole_number(1)] = None,
     device: str = "cpu",
     policy: PolicyName = DEFAULT_POLICY,
-    policy_size: PolicySize = SMALL,
     records: Path = TUNING,
     write: Path | None = None,
 ) -> None:
@@ -86,8 +84,8 @@ def tune(
         workers: Number of runs at once, each a process with one thread (default: all cores; with --device
             cuda, all GPUs).
         device: Device that runs the policies, for example cpu or cuda, which gives each run one of the GPUs.
-        policy: flow, discrete_diffusion, or a class of your own as module:Class.
-        policy_size: small, base (5 million parameters) or large (40 million), for built-in policies.
+        policy: flow or discrete_diffusion, larger ones as flow-base (5 million parameters) or flow-large (40
+            million), or a class of your own as module:Class.
         records: Folder of the records.
         write: File for the chosen settings; it keeps the settings of other methods. For built-in methods,
             `clbench run` reads methods/tuned/. Cannot be used with --values.
@@ -106,7 +104,6 @@ def tune(
 
     add_cwd_to_path()
     with checked_input():
-        policy = policy_name(policy, policy_size)
         first = RunSpec(
             scenario, "", first_seed, device=device, split="validation", targets=targets, policy=policy
         )

@@ -24,7 +24,7 @@ from clbench.records.reader import read_record
 from clbench.runs.tuning import tuned
 from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
-from clbench.spec.policies import DEFAULT_POLICY, SMALL, policy_name
+from clbench.spec.policies import DEFAULT_POLICY
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
@@ -44,7 +44,6 @@ def promised(target: str) -> set[Path]:
     options.add_argument("--seeds", type=int)
     options.add_argument("--order", type=int, default=0)
     options.add_argument("--policy", default=DEFAULT_POLICY)
-    options.add_argument("--policy-size", default=SMALL)
     options.add_argument("--perturb", action="store_true")
     options.add_argument("--records", type=Path, default=RECORDS)
     for field in ("step_factor", "direction", "orthogonal", "rank"):
@@ -59,9 +58,8 @@ def promised(target: str) -> set[Path]:
             }
             for scenario, method in itertools.product(asked.scenarios.split(","), asked.methods):
                 label = label_of(method, read_changes(method, load_method(method), chosen))
-                policy = policy_name(asked.policy, asked.policy_size)
                 names |= {
-                    ROOT / asked.records / record_name(scenario, label, seed, asked.order, policy)
+                    ROOT / asked.records / record_name(scenario, label, seed, asked.order, asked.policy)
                     for seed in range(asked.seeds)
                 }
     return names

@@ -85,7 +85,7 @@ def _commands(parent: App, prefix: str) -> Iterator[str]:
         if name.startswith("-") or name in NOT_PROMISED:
             continue
         yield f"{prefix} {name}"
-        for argument in command.assemble_argument_collection():
+        for argument in command.assemble_argument_collection(default_parameter=app.default_parameter):
             words = (f"{name} {word}" for word in argument.names)
             yield from (f"{prefix} {word}" for word in words if word not in NOT_PROMISED)
         yield from _commands(command, f"{prefix} {name}")
