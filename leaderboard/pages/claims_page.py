@@ -8,7 +8,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from rich.text import Text
 
-from clbench.base.text import counted
+from clbench.base.text import counted, listed
 
 from ..board.commands import run_command
 from ..board.summary import grouped
@@ -17,6 +17,9 @@ from ..claims.evidence import LEAST_SEEDS, Figure
 from ..claims.judges import Judged
 from ..views.format import MISSING, format_interval
 from ..views.markdown import template
+
+CHECKS = {"replayed": "replayed {}", "retrained": "repeated {} as a whole"}
+"""What another process did with the records of a tier."""
 
 
 def page(judged: Sequence[Judged]) -> str:
@@ -30,6 +33,7 @@ def page(judged: Sequence[Judged]) -> str:
         papers=grouped((claim.paper, (claim, members)) for claim, members in by_claim.items()).items(),
         not_used=list(refused.values()),
         missing=_missing,
+        checked=_checked,
     )
 
 
@@ -62,6 +66,23 @@ def _missing(one: Judged) -> list[str]:
     lines = [f"`{run_command(scenario, *plain)}`."] if plain else []
     lines += [f"`{run_command(scenario, label)}`." for label in labels if label not in plain]
     return lines
+
+
+def _checked(one: Judged) -> str:
+    """Return how many of the records behind the figures of a finding were replayed or trained again."""
+    read = {
+        (label, seed)
+        for figure in (*one.finding.figures, *one.finding.controls)
+        for label in figure.methods
+        for seed in figure.seeds
+    }
+    runs = one.evidence.runs
+    tiers = [runs[label][seed].tier for label, seed in read if seed in runs.get(label, {})]
+    if not tiers:
+        return ""
+    counts = ((tiers.count(tier), words) for tier, words in CHECKS.items())
+    done = listed([words.format(count) for count, words in counts if count]) or "replayed none"
+    return f"Of the {counted(len(tiers), 'record')} behind the figures, another process {done}."
 
 
 def figure_text(figure: Figure) -> str:

@@ -19,6 +19,9 @@ from clbench.spec.registry import load_scenario
 
 ROOT = Path(__file__).parents[3]
 CLAIMS = resolve("clbench.leaderboard.claims.judges:CLAIMS")
+verification_path, verification_text = (
+    resolve(f"clbench.leaderboard.board.tiers:{name}") for name in ("verification_path", "verification_text")
+)
 
 RULES = {
     "C1": ("11-23 07:13", "7af4eb25"),
@@ -104,6 +107,22 @@ def test_a_record_may_say_anything_about_its_start(bench: Bench, text: object) -
     bench.add("sft", edit=started(text))
     known = text == "2999-01-01"
     assert (f"dates from 2999-01-01; none of the {len(IDS)} rules changed after it." in bench.page()) == known
+
+
+def test_a_verdict_says_how_many_of_its_records_another_process_replayed_or_repeated(bench: Bench) -> None:
+    for label in ("sft", "frozen", "sft@1"):
+        bench.add(label)
+    # C1 reads sft, frozen and the ladder's sft, three seeds each
+    assert "- Of the 9 records behind the figures, another process replayed none." in section(
+        bench.page(), "C1"
+    )
+    for method, tier in (("sft", "replayed"), ("frozen", "replayed"), ("frozen", "retrained")):
+        record = record_path(bench.folder / "records", SCENARIO, method, 0 if tier == "replayed" else 1)
+        values = {"tier": tier, "record": sha256(record.read_bytes()).hexdigest()}
+        verification_path(record).write_text(verification_text(values), encoding="utf-8")
+    said = "- Of the 9 records behind the figures, another process replayed 2 and repeated 1 as a whole."
+    assert said in section(bench.page(), "C1")
+    assert "records behind the figures" not in section(bench.page(), "C5")  # algebra
 
 
 def test_a_rule_that_says_something_new_gets_the_time_of_its_change() -> None:
