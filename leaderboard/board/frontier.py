@@ -19,7 +19,7 @@ from clbench.scoring.intervals import Estimate, Runs, estimate, row_generator
 from clbench.spec.references import BASELINE
 
 from .paths import LADDER, beside
-from .runs import ALIKE, Run, Sifted, is_number, read_run, read_runs, sift_by
+from .runs import ALIKE, Run, Sift, Sifted, differences, is_number, read_run, read_runs, sift_by
 from .summary import DIVISIONS, GAIN, grouped
 
 FACTOR = "step_factor"
@@ -72,22 +72,30 @@ def read_ladder(folder: Path, board: Iterable[Run] = ()) -> Sifted:
 
     Args:
         folder: The folder.
-        board: Runs of the board. Their worlds must move as those of the ladder, or no gain could be computed.
+        board: Runs of the board, to which those of the ladder must be comparable.
     """
-
-    def rollouts(run: Run) -> Any:
-        return run.record.fingerprint.get("rollouts")
-
-    def reason(run: Run) -> str:
-        alike = rollouts(run) == moved.get(run.table, rollouts(run))
-        return "" if alike else "its simulator does not match that of the board's records."
-
-    moved = {run.table: rollouts(run) for run in board}
-    runs, refused = read_runs(folder, partial(read_run, changed=True), (*ALIKE, on_the_ladder))
-    runs, others = sift_by(runs, reason)
+    sifts = (like_the_board(board), *ALIKE, on_the_ladder)
+    runs, refused = read_runs(folder, partial(read_run, changed=True), sifts)
     runs.sort(key=lambda run: run.table)
-    refused = [*refused, *others]
     return runs, [dataclasses.replace(one, path=f"{folder.name}/{one.path}") for one in refused]
+
+
+def like_the_board(board: Iterable[Run]) -> Sift:
+    """Return the sift that keeps runs made and evaluated like the board's, where the board has any."""
+    examples = {run.table: run for run in board}
+
+    def traits(run: Run) -> dict[str, Any]:
+        return {
+            **vars(run.scores.layout),
+            **vars(run.published),
+            "rollouts": run.record.fingerprint.get("rollouts"),
+        }
+
+    def fault(run: Run) -> str:
+        fields = differences(traits(run), traits(examples.get(run.table, run)))
+        return f"it cannot be compared with the board: {', '.join(fields)} differ." if fields else ""
+
+    return lambda runs: sift_by(runs, fault)
 
 
 def frontiers_of(ladder: Sequence[Run]) -> dict[str, tuple[Curve, ...]]:

@@ -28,17 +28,8 @@ from clbench.scoring.rates import Rates
 from clbench.scoring.scores import Scores
 
 from ..board.costs import step_ratio
-from ..board.frontier import FACTOR, apart_from_the_factor, ladder_of, on_the_ladder
-from ..board.runs import (
-    ALIKE,
-    Run,
-    Sift,
-    differences,
-    is_number,
-    read_run,
-    read_runs,
-    sift_by,
-)
+from ..board.frontier import FACTOR, apart_from_the_factor, ladder_of, like_the_board, read_ladder
+from ..board.runs import ALIKE, Run, is_number, read_run, read_runs
 from ..board.summary import NotShown
 
 LEAST_SEEDS = 2
@@ -322,18 +313,17 @@ def read_evidence(records: Path, controls: Path) -> Callable[[str], Evidence]:
     A run of the ladder has the label of `rung`. The ladder's folder lies beside that of the records.
     """
     scored, refused = read_runs(records, read_run, ALIKE)
-    like = _like(scored)
-    changed, refused_controls = read_runs(controls, partial(read_run, changed=True), (like, *ALIKE))
-    ladder = ladder_of(records)
-    rungs, refused_rungs = read_runs(ladder, partial(read_run, changed=True), (like, *ALIKE, on_the_ladder))
+    sifts = (like_the_board(scored), *ALIKE)
+    changed, refused_controls = read_runs(controls, partial(read_run, changed=True), sifts)
+    rungs, refused_rungs = read_ladder(ladder_of(records), scored)
     labelled = [
         *((run.method, run) for run in (*scored, *changed)),
         *((rung(apart_from_the_factor(run), run.record.run.changes[FACTOR]), run) for run in rungs),
     ]
-    not_used = tuple(
-        NotShown(f"{name}/{entry.path}", entry.reason)
-        for name, entries in (("records", refused), ("controls", refused_controls), ("ladder", refused_rungs))
-        for entry in entries
+    named = (("records", refused), ("controls", refused_controls))
+    not_used = (
+        *(NotShown(f"{name}/{one.path}", one.reason) for name, entries in named for one in entries),
+        *refused_rungs,
     )
 
     def on(scenario: str) -> Evidence:
@@ -350,21 +340,3 @@ def read_evidence(records: Path, controls: Path) -> Callable[[str], Evidence]:
 def rung(method: str, factor: float) -> str:
     """Return the label of a run of the ladder: the method and its factor, as "sft@0.3"."""
     return f"{method}@{factor:g}"
-
-
-def _like(scored: Sequence[Run]) -> Sift:
-    """Return the sift that keeps runs that were made and evaluated like the board's."""
-    examples = {run.table: run for run in scored}
-
-    def traits(run: Run) -> dict[str, Any]:
-        return {
-            **vars(run.scores.layout),
-            **vars(run.published),
-            "rollouts": run.record.fingerprint.get("rollouts"),
-        }
-
-    def fault(run: Run) -> str:
-        fields = differences(traits(run), traits(examples.get(run.table, run)))
-        return f"it cannot be compared with the board: {', '.join(fields)} differ." if fields else ""
-
-    return lambda runs: sift_by(runs, fault)

@@ -117,7 +117,7 @@ def test_a_ladder_of_another_simulator_has_no_curve_and_the_board_says_why(
     board = compute_board(records)
     assert not board.frontiers
     assert [one.reason for one in board.not_shown] == [
-        "its simulator does not match that of the board's records."
+        "it cannot be compared with the board: rollouts differ."
     ] * 2
 
 
