@@ -34,6 +34,7 @@ from .figures import (
     answer_curve,
     drift_ratio,
     early_success,
+    is_unknown,
     learning_curve,
     loses_no_answers,
     question_drop,
@@ -126,15 +127,16 @@ def stop_gradient_keeps_and_wastes(evidence: Evidence) -> Finding:
     if loses_no_answers(of_sft):
         return _by_steps(share_of_steps(evidence, "stop_gradient@1", "sft@1"), (early, answers, of_sft))
     by_answers = answers.low > 0.01 or early.high < -0.05
+    verdict = decided(
+        holds=answers.high < 0.01 and early.high < -0.05, fails=answers.low > 0.01 or early.low > -0.05
+    )
+    deciding_one = (answers, 0.01) if by_answers else (early, -0.05)
     return Finding(
-        decided(
-            holds=answers.high < 0.01 and early.high < -0.05,
-            fails=answers.low > 0.01 or early.low > -0.05,
-        ),
+        "undecided" if is_unknown(of_sft) else verdict,
         (early, answers),
         (of_sft,),
         (),
-        what_would_change(*((answers, 0.01) if by_answers else (early, -0.05))),
+        what_would_change(*((of_sft, 0.01) if is_unknown(of_sft) else deciding_one)),
     )
 
 
@@ -228,7 +230,7 @@ def keeps_answers(evidence: Evidence) -> Finding:
     if loses_no_answers(of_sft):
         return Finding("cannot be shown here", (aegis,), (sft, *gains), (NOTHING_TO_KEEP,), LOSES_ANSWERS)
     return Finding(
-        decided(holds=aegis.low >= -0.01, fails=aegis.high < -0.01),
+        "undecided" if is_unknown(of_sft) else decided(holds=aegis.low >= -0.01, fails=aegis.high < -0.01),
         (aegis,),
         (sft, *gains, *answer_curve(evidence, "aegis")),
         (
@@ -248,7 +250,7 @@ def keeps_answers(evidence: Evidence) -> Finding:
                 does_not="the anchor's direction matters",
             ),
         ),
-        what_would_change(aegis, -0.01),
+        what_would_change(*((of_sft, 0.01) if is_unknown(of_sft) else (aegis, -0.01))),
     )
 
 
@@ -316,13 +318,14 @@ def removes_drift(evidence: Evidence) -> Finding:
     near = anchor_ratio(evidence)
     on_questions, at_random = (drift_ratio(evidence, method) for method in ("aegis", RANDOM))
     first, last = (anchor_distance(evidence, "aegis", end) for end in ENDS)
-    near_enough = near.high < 0.5
+    both, near_enough = near.high < 0.5 and on_questions.high < 0.5, near.high < 0.5
+    second = max((near, on_questions), key=lambda one: one.high) if both else on_questions
     return Finding(
-        decided(holds=near_enough and on_questions.high < 0.5, in_part=near_enough, fails=near.low > 0.5),
+        decided(holds=both, in_part=near_enough and on_questions.high >= 0.5, fails=near.low > 0.5),
         (near, on_questions),
         (first, last, *(anchor_distance(evidence, RANDOM, end) for end in ENDS), at_random),
         (*_on_questions(on_questions), *_where_it_begins(first, last)),
-        what_would_change(on_questions if near_enough else near, 0.5),
+        what_would_change(second if near_enough else near, 0.5),
     )
 
 
@@ -331,8 +334,8 @@ def _where_it_begins(first: Figure, last: Figure) -> tuple[str, ...]:
     if not last.high < first.low:
         return ()
     return (
-        "The robot's batches are no questions, so that their squared distance to the anchor is "
-        f"{first.value:.0f} before the first step. It ends at {last.value:.1f}. The projection removes only "
+        "The robot's batches are no questions, so that their distance to the anchor is "
+        f"{first.value:.1f} before the first step. It ends at {last.value:.1f}. The projection removes only "
         "what leads away: it does not hold the robot's hidden states in place, and they move onto those of "
         "the questions.",
     )
@@ -343,8 +346,8 @@ def _on_questions(drift: Figure) -> tuple[str, ...]:
     if not drift.high >= 0.5:  # also without an interval
         return ()
     return (
-        "The hidden states of questions, whose answers can be lost nevertheless (A4), drift "
-        f"{drift.value:.2f} [{drift.low:.2f}, {drift.high:.2f}] times as far as those of sft.",
+        "The hidden states of questions, whose answers can be lost nevertheless (A4), move "
+        f"{drift.value:.2f} [{drift.low:.2f}, {drift.high:.2f}] times as far as with sft.",
     )
 
 
@@ -357,6 +360,13 @@ def _near_the_anchor(near: Figure) -> tuple[str, ...]:
         "The projection acts: at the end of the first stage, the distance of the robot's batch to the anchor "
         f"is {figure} of that with a random direction; batches near the anchor need not keep the answers.",
     )
+
+
+def _nearest_bar(time: Figure) -> float:
+    """Return the bar of A7 that the interval contains or, if it contains none, that is nearest to an end."""
+    bars = (1.2, 1.6)
+    inside = [bar for bar in bars if time.low < bar <= time.high]
+    return min(inside or bars, key=lambda bar: min(abs(time.low - bar), abs(time.high - bar)))
 
 
 @claim(
@@ -383,5 +393,5 @@ def costs_40_percent(evidence: Evidence) -> Finding:
         (time, evidence.cost("bytes_kept", "aegis", "bytes kept of aegis, the anchor")),
         change="Runs whose stages read no prior data."
         if buffer
-        else what_would_change(time, 1.2 if time.value < 1.4 else 1.6),
+        else what_would_change(time, _nearest_bar(time)),
     )

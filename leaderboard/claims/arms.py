@@ -5,7 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-from .claim import Finding, Verdict, best_first, decided, deciding
+from .claim import (
+    Finding,
+    Verdict,
+    best_first,
+    cannot_be_shown,
+    decided,
+    deciding,
+    what_would_change,
+)
 from .evidence import Evidence, Figure
 from .figures import share_afterwards, share_between
 
@@ -59,9 +67,16 @@ def rises_above(bar: float, counting: Iterable[Figure], every: Iterable[Figure])
     return decided(holds=any(one.low > bar for one in counting), fails=all(one.high < bar for one in every))
 
 
-def deciding_arm(verdict: Verdict, counting: Iterable[Figure], every: Iterable[Figure], bar: float) -> Figure:
-    """Return the figure that would first change a verdict; only an arm that counts makes a claim hold."""
-    return deciding(verdict, best_first(list(counting if verdict == "holds" else every)), bar)
+def change_of_arms(verdict: Verdict, counting: Sequence[Figure], every: Sequence[Figure], bar: float) -> str:
+    """Return what would change the verdict of a bar on the arms: only one that counts makes a claim hold."""
+    if verdict != "undecided":
+        judged = best_first(list(every if verdict == "does not hold" else counting))
+        return what_would_change(deciding(verdict, judged, bar), bar)
+    may_rise = (figure for figure in best_first(counting) if not figure.high < bar)
+    if (figure := next(may_rise, None)) is not None:
+        return what_would_change(figure, bar)
+    above = next(figure for figure in every if not figure.high < bar)  # it keeps the claim from failing
+    return f'An interval of "{above.what}" below {bar:{above.form}}: its arm does not count.'
 
 
 def if_all_counted(arms: Sequence[str], verdict: Verdict, of_all: Verdict) -> tuple[str, ...]:
@@ -85,17 +100,23 @@ def without_an_arm(
     figures: Sequence[Figure],
     controls: Sequence[Figure],
     of_all: Verdict | None = None,
+    *reasons: tuple[str, str],
 ) -> Finding:
-    """Return the finding on a board on which no arm counts; `of_all` is the verdict if all did."""
+    """Return the finding on a board on which no arm counts.
+
+    Args:
+        evidence: Records of the board.
+        figures: Figures of all arms.
+        controls: Other figures.
+        of_all: Verdict if all arms counted.
+        reasons: Further reasons, as in `cannot_be_shown`.
+    """
     shares = tuple(one(evidence, arm) for arm in ARMS for one in (share_between, share_afterwards))
-    return Finding(
-        "cannot be shown here",
+    inactive = inactive_sentences(evidence)
+    return cannot_be_shown(
         best_first(figures),
         (*controls, *shares),
-        (
-            *inactive_sentences(evidence),
-            *(if_all_counted((), "cannot be shown here", of_all) if of_all is not None else ()),
-        ),
-        NEEDS_WEIGHTS,
+        [*((why, NEEDS_WEIGHTS) for why in inactive), *reasons],
+        *(if_all_counted((), "cannot be shown here", of_all) if of_all is not None else ()),
         about=ARMS,
     )

@@ -139,6 +139,29 @@ def decided(*, holds: bool, fails: bool, in_part: bool = False) -> Verdict:
     return "holds" if holds else "holds in part" if in_part else "does not hold" if fails else "undecided"
 
 
+def cannot_be_shown(
+    figures: Sequence[Figure],
+    controls: Sequence[Figure],
+    reasons: Sequence[tuple[str, str]],
+    *more: str,
+    about: tuple[str, ...] = (),
+) -> Finding:
+    """Return the finding on a board that cannot show a claim.
+
+    Args:
+        figures: Figures of the rule.
+        controls: Other figures.
+        reasons: Why it cannot be shown, each with what would remove the reason: all must go. A sentence that
+            is no reason has an empty one.
+        more: Further sentences.
+        about: See `Finding.about`.
+    """
+    why, changes = zip(*reasons, strict=True)
+    every = (*dict.fromkeys(filter(None, why)), *more)
+    change = " ".join(dict.fromkeys(filter(None, changes)))
+    return Finding("cannot be shown here", tuple(figures), tuple(controls), every, change, about)
+
+
 def what_would_change(figure: Figure, bar: float) -> str:
     """Return the sentence that says how far the interval of the deciding figure is from the rule's bar."""
     interval = f'interval of "{figure.what}"'

@@ -13,7 +13,7 @@ from .arms import (
     ARMS,
     NEEDS_WEIGHTS,
     arms_that_count,
-    deciding_arm,
+    change_of_arms,
     if_all_counted,
     inactive_sentences,
     rises_above,
@@ -26,6 +26,7 @@ from .claim import (
     Paper,
     Verdict,
     best_first,
+    cannot_be_shown,
     claim,
     decided,
     deciding,
@@ -69,24 +70,25 @@ def sft_degrades(evidence: Evidence) -> Finding:
     """Fine-tuning without constraint degrades pretrained skills."""
     drop, published = (retention_drop(evidence, label) for label in ("sft", rung("sft", PUBLISHED)))
     joint = kept(evidence, "joint", rung("sft", PUBLISHED))  # joint has the scenario's learning rate
+    learned = evidence.metric("adaptation", "joint")
     sparse = replace(evidence.metric("update_sparsity", "sft"), note="density is not judged")
     return Finding(
         decided(holds=drop.low > 0.05, fails=drop.high < 0.05),
         (drop, published),
         (retention_drop(evidence, "frozen"), retention_drop(evidence, "joint"), joint, sparse),
-        _what_joint_says(joint),
+        _what_joint_says(joint, learned),
         what_would_change(drop, 0.05),
     )
 
 
-def _what_joint_says(gain: Figure) -> tuple[str, ...]:
+def _what_joint_says(gain: Figure, learned: Figure) -> tuple[str, ...]:
     """Return whether training on all data keeps more than sft at its learning rate; nothing if unknown."""
     if math.isnan(gain.low):
         return ()
     if gain.low > 0:
         return (
-            "joint, which also learns every target, keeps more than sft at the same learning rate: learning "
-            "alone need not degrade.",
+            f"joint, which trains on all data and learns {learned.value:.2f} of the targets, keeps more than "
+            "sft at the same learning rate: learning alone need not degrade.",
         )
     less = "keeps even less than" if gain.high < 0 else "is not told apart from"
     return (
@@ -118,7 +120,11 @@ def keeps_20_points_more(evidence: Evidence) -> Finding:
     sft = [evidence.metric("retention", label) for label in ("sft", rung("sft", PUBLISHED))]
     counting = [figure for figure in at_best if figure.methods[0] in arms]
     published = [figure for figure in at_one if figure.methods[0] in {rung(arm, PUBLISHED) for arm in arms}]
+    every, keeps_too_much = [*at_best, *at_one], all(one.low > 0.80 for one in sft)
+    verdict, of_all = _keeps_more(counting, published, every), _keeps_more(at_best, at_one, every)
     best = best_first(counting or at_best)[0]
+    if verdict == "holds":
+        best = deciding(verdict, counting, 0.20)
     figures = (best, *(one for one in (*at_best, *at_one) if one is not best))
     controls = controls_of(evidence, best.methods[0])
     controls_at_one = controls_at_the_full_rate(evidence)
@@ -127,37 +133,33 @@ def keeps_20_points_more(evidence: Evidence) -> Finding:
     shares = tuple(one(evidence, arm) for arm in ARMS for one in (share_between, share_afterwards))
     shown = (*sft, *alike, *controls, *controls_at_one, *shares)
     at_one_says = what_the_full_rate_says(best_first(at_one)[0], controls_at_one)
-    every = [*at_best, *at_one]
-    of_all = _keeps_more(at_best, at_one, every)
-    if not arms or all(one.low > 0.80 for one in sft):
-        reason = ("sft keeps too much for a gain of 0.20.",) if arms else ()
-        return Finding(
-            "cannot be shown here",
-            figures,
-            shown,
-            (
-                *inactive_sentences(evidence),
-                *reason,
-                *(() if arms else if_all_counted(arms, "cannot be shown here", of_all)),
-                *at_one_says,
-            ),
-            "A setting in which sft keeps less than 0.80." if arms else NEEDS_WEIGHTS,
-        )
-    verdict = _keeps_more(counting, published, every)
-    judged = {"holds": counting, "holds in part": published}.get(verdict, every)
+    may_hold = {"holds": counting, "holds in part": published}.get(verdict, [*counting, *published])
+    inactive = inactive_sentences(evidence)
+    if not arms or keeps_too_much:
+        reasons = [(why, "" if arms else NEEDS_WEIGHTS) for why in inactive]
+        reasons += [KEEPS_TOO_MUCH] if keeps_too_much else []
+        if_they_did = if_all_counted(arms, "cannot be shown here", of_all) if not keeps_too_much else ()
+        return cannot_be_shown(figures, shown, reasons, *if_they_did, *at_one_says)
     return Finding(
         verdict,
         figures,
         shown,
         (
-            *inactive_sentences(evidence),
+            *inactive,
             *if_all_counted(arms, verdict, of_all),
             *what_controls_say(best, controls, arms),
             *at_one_says,
         ),
-        what_would_change(deciding(verdict, best_first(list(judged)), 0.20), 0.20),
+        change_of_arms(verdict, may_hold, every, 0.20),
         about=ARMS,
     )
+
+
+KEEPS_TOO_MUCH = (
+    "sft keeps too much for a gain of 0.20.",
+    "A setting in which sft keeps less than 0.80.",
+)
+"""A reason why C2 cannot be shown, and what would remove it."""
 
 
 def _keeps_more(at_best: Sequence[Figure], at_one: Sequence[Figure], every: Sequence[Figure]) -> Verdict:
@@ -204,19 +206,16 @@ def as_good_as_replay(evidence: Evidence) -> Finding:
     verdict = _reaches(arms, every.values())
     holding = [arm[0].methods[0] for arm in arms if all(figure.low >= -0.05 for figure in arm)]
     others = [figure for arm in ARMS if arm not in counting for figure in every[arm]]
-    worst = {arm: min(figures, key=lambda one: one.high) for arm, figures in every.items()}
     sentences = [f"It holds for {' and '.join(holding)}."] if holding else []
     if verdict == "does not hold":
-        names = " and ".join(arm[0].methods[0] for arm in arms)
-        sentences = [f"Replay{_share_of_replay(evidence)} certainly keeps more skills than {names}."]
+        failing = [min(arm, key=_upper_end) for arm in arms]
+        sentences = [_keeps_fewer(evidence, figure) for figure in failing]
     return Finding(
         verdict,
         best_first([arm[0] for arm in arms]),
         (*chain.from_iterable(arm[1:] for arm in arms), *others),
         (*inactive_sentences(evidence), *if_all_counted(counting, verdict, of_all), *sentences),
-        what_would_change(
-            deciding_arm(verdict, [worst[arm] for arm in counting], worst.values(), -0.05), -0.05
-        ),
+        what_would_change(_deciding_replay(verdict, arms, list(every.values())), -0.05),
         about=ARMS,
     )
 
@@ -227,6 +226,35 @@ def _reaches(counting: Iterable[Sequence[Figure]], every: Iterable[Sequence[Figu
         holds=any(all(figure.low >= -0.05 for figure in arm) for arm in counting),
         fails=all(any(figure.high < -0.05 for figure in arm) for arm in every),
     )
+
+
+def _upper_end(figure: Figure) -> float:
+    """Return the upper end of an interval, infinite if it is unknown."""
+    return math.inf if math.isnan(figure.high) else figure.high
+
+
+def _lower_end(figure: Figure) -> float:
+    """Return the lower end of an interval, infinitely low if it is unknown."""
+    return -math.inf if math.isnan(figure.low) else figure.low
+
+
+def _deciding_replay(
+    verdict: Verdict, counting: Sequence[Sequence[Figure]], every: Sequence[Sequence[Figure]]
+) -> Figure:
+    """Return the figure on which the verdict of C3 hangs, of the figures of each arm against each replay.
+
+    An arm reaches replay by its lowest lower end, and fails by its lowest upper end.
+    """
+    if verdict == "does not hold":
+        return max((min(arm, key=_upper_end) for arm in every), key=_upper_end)
+    return max((min(arm, key=_lower_end) for arm in counting), key=_lower_end)
+
+
+def _keeps_fewer(evidence: Evidence, figure: Figure) -> str:
+    """Return that an arm certainly keeps fewer skills than a kind of replay."""
+    arm, replay = figure.methods[:2]
+    share = _share_of_replay(evidence) if replay == "experience_replay" else ""
+    return f"{replay}{share} certainly keeps more skills than {arm}."
 
 
 def _share_of_replay(evidence: Evidence) -> str:
@@ -259,22 +287,18 @@ def stays_sparse(evidence: Evidence) -> Finding:
     arms = [every[arm] for arm in counting]
     response = sparsity(evidence, _small_steps(evidence), rung("sft", PUBLISHED))
     controls = (response, sparsity(evidence, "l2_sp", "sft"))
+    insensitive = (
+        f"Much smaller steps keep only {response.value:.3f} more of the weights in place: a method that "
+        "makes steps smaller cannot change this measure.",
+        "A measure of sparsity that responds to smaller steps.",
+    )
+    reasons = [insensitive] if response.high < 0.05 else []
     if not arms:
-        return without_an_arm(evidence, list(every.values()), controls)
+        return without_an_arm(evidence, list(every.values()), controls, None, *reasons)
     figures = best_first(arms)
-    if response.high < 0.05:
-        return Finding(
-            "cannot be shown here",
-            figures,
-            controls,
-            (
-                *inactive_sentences(evidence),
-                f"Much smaller steps keep only {response.value:.3f} more of the weights in place: a method "
-                "that makes steps smaller cannot change this measure.",
-            ),
-            "A measure of sparsity that responds to smaller steps.",
-            about=ARMS,
-        )
+    if reasons:
+        inactive = [(why, "") for why in inactive_sentences(evidence)]
+        return cannot_be_shown(figures, controls, [*inactive, *reasons], about=ARMS)
     responds = response.high >= 0.05  # not known without records
     verdict, of_all = (
         rises_above(0.05, some, every.values()) if responds else "undecided"
@@ -290,7 +314,9 @@ def stays_sparse(evidence: Evidence) -> Finding:
             *if_all_counted(counting, verdict, of_all),
             *([more] if verdict == "does not hold" else []),
         ),
-        what_would_change(deciding_arm(verdict, arms, every.values(), 0.05) if responds else response, 0.05),
+        change_of_arms(verdict, arms, list(every.values()), 0.05)
+        if responds
+        else what_would_change(response, 0.05),
         about=ARMS,
     )
 
@@ -357,10 +383,12 @@ def costs_nothing(evidence: Evidence) -> Finding:
         for kind in ("demonstrations", "questions")
     )
     more = reads or bytes_kept.value > bytes_of_sft.value or added.value > added_by_sft.value
+    unknown = [one for one in (bytes_kept, bytes_of_sft, added, added_by_sft) if math.isnan(one.value)]
+    change = what_would_change(*((unknown[0], 0.0) if unknown else (time, 1.05)))
     return Finding(
         decided(holds=same and not reads and time.high <= 1.05, fails=more or time.low > 1.05),
         (time, bytes_kept, added),
         (bytes_of_sft, added_by_sft),
         (),
-        "Runs that keep, add and read no more than sft." if more else what_would_change(time, 1.05),
+        "Runs that keep, add and read no more than sft." if more else change,
     )

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from clbench.base.text import listed
+
 from .arms import (
     ARMS,
     arms_that_count,
-    deciding_arm,
+    change_of_arms,
     if_all_counted,
     inactive_sentences,
     rises_above,
@@ -18,10 +20,10 @@ from .claim import (
     Finding,
     Verdict,
     best_first,
+    cannot_be_shown,
     claim,
     decided,
     not_told_apart,
-    what_would_change,
 )
 from .consft import CONSFT
 from .consft_controls import CONTROLS, sft_at_the_rate_of
@@ -68,7 +70,7 @@ def keeps_earlier_targets(evidence: Evidence) -> Finding:
             *if_all_counted(counting, verdict, of_all),
             _what_keeps_targets(over_sft, over_controls),
         ),
-        what_would_change(deciding_arm(verdict, arms, every, -0.10), -0.10),
+        change_of_arms(verdict, arms, every, -0.10),
         about=ARMS,
     )
 
@@ -89,12 +91,12 @@ def _gains_in_transfer(evidence: Evidence, arm: str) -> Iterator[Figure]:
 
 def _what_keeps_targets(over_sft: Figure, over_controls: Sequence[Figure]) -> str:
     """Return what sft and the controls say about an arm's gain in backward transfer."""
-    equal = [one.methods[1] for one in over_controls if not one.low > 0]
-    if over_sft.low > 0 and equal:
-        are = "is" if len(equal) == 1 else "are"
+    reaching = [one.methods[1] for one in over_controls if one.low <= 0]
+    if over_sft.low > 0 and reaching:
+        do = "does" if len(reaching) == 1 else "do"
         return (
-            f"sft at its best learning rate does not reach it, but {' and '.join(equal)} {are} not told "
-            "apart from it: weighing samples need not be the cause."
+            f"sft at its best learning rate certainly keeps fewer, but {listed(reaching)} {do} not: weighing "
+            "samples need not be the cause."
         )
     return not_told_apart(
         over_sft,
@@ -121,28 +123,27 @@ def prevents_spatial_overfitting(evidence: Evidence) -> Finding:
     """Prevents overfitting to the positions in the demonstrations."""
     of_sft = perturbation_loss(evidence, "sft")
     every = [perturbation_gain(evidence, arm, "sft") for arm in ARMS]
-    if of_sft.high < 0.05:
-        return Finding(
-            "cannot be shown here",
-            best_first(every),
-            (of_sft,),
-            (
-                *inactive_sentences(evidence),
-                "sft certainly loses less than 0.05 in perturbed episodes: there is nothing to prevent.",
-            ),
-            "Starts farther from the demonstrated ones, at which sft fails.",
-            about=ARMS,
-        )
+    reasons = [NOTHING_TO_PREVENT] if of_sft.high < 0.05 else []
     counting = arms_that_count(evidence)
     arms = [figure for arm, figure in zip(ARMS, every, strict=True) if arm in counting]
     if not arms:
-        return without_an_arm(evidence, every, (of_sft,))
+        return without_an_arm(evidence, every, (of_sft,), None, *reasons)
+    if reasons:
+        inactive = [(why, "") for why in inactive_sentences(evidence)]
+        return cannot_be_shown(best_first(every), (of_sft,), [*inactive, *reasons], about=ARMS)
     verdict = rises_above(0.05, arms, every)
     return Finding(
         verdict,
         best_first(arms),
         (of_sft, *(figure for arm, figure in zip(ARMS, every, strict=True) if arm not in counting)),
         inactive_sentences(evidence),
-        what_would_change(deciding_arm(verdict, arms, every, 0.05), 0.05),
+        change_of_arms(verdict, arms, every, 0.05),
         about=ARMS,
     )
+
+
+NOTHING_TO_PREVENT = (
+    "sft certainly loses less than 0.05 in perturbed episodes: there is nothing to prevent.",
+    "Starts farther from the demonstrated ones, at which sft fails.",
+)
+"""A reason why C8 cannot be shown, and what would remove it."""

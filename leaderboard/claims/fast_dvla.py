@@ -6,14 +6,14 @@ how well a policy adapts. With stages to a criterion all methods learn as well, 
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 
 from clbench.scoring.intervals import NO_ESTIMATE, Estimate
 
 from ..policies.decoders import Decoding, read_decoding
-from .claim import ANYWHERE, Finding, Paper, claim, decided, is_open, what_would_change
+from .claim import ANYWHERE, Finding, Paper, cannot_be_shown, claim, decided, is_open, what_would_change
 from .evidence import Evidence, Figure, rung
-from .figures import PUBLISHED, loses_no_answers, median_stage, question_drop, share_of_steps
+from .figures import PUBLISHED, is_unknown, loses_no_answers, median_stage, question_drop, share_of_steps
 
 CAPVECTOR = Paper("CapVector (the abstract of Fast-dVLA)", ("2603.25661", "2605.10903"))
 FAST_DVLA = Paper("Fast-dVLA's body", ("2603.25661",))
@@ -44,7 +44,7 @@ LONGER = "Targets that take plain fine-tuning at least 20 steps at the scenario'
 
 def _is_too_short(stage: Figure, steps: Figure) -> bool:
     """Return whether stages are too short for the open question whether 5 % of the steps are saved."""
-    return stage.value < FEWEST_STEPS and is_open(steps, 0.95)
+    return stage.value < FEWEST_STEPS and is_open(steps, 0.95) and not is_unknown(steps)
 
 
 def _no_capability(evidence: Evidence) -> bool:
@@ -62,17 +62,27 @@ def _why_known(evidence: Evidence) -> str:
     )
 
 
-def _not_shown(evidence: Evidence, figure: Figure, *controls: Figure) -> Finding | None:
+def _not_shown(evidence: Evidence, figures: Sequence[Figure], *controls: Figure) -> Finding | None:
+    """Return the finding on a board that could not show the saved steps, the first figure; else None.
+
+    Without an interval of the answers that sft loses, the finding is undecided.
+    """
+    stage, answers = median_stage(evidence, SFT), question_drop(evidence, SFT)
+    reasons = [(TOO_SHORT, LONGER)] if _is_too_short(stage, figures[0]) else []
+    reasons += [(_why_known(evidence), A_CAPABILITY)] if loses_no_answers(answers) else []
+    if reasons:
+        return cannot_be_shown(figures, (*controls, stage, answers), reasons)
+    if is_unknown(answers):
+        return Finding("undecided", tuple(figures), controls, (), what_would_change(answers, 0.01))
+    return None
+
+
+def _no_vector(evidence: Evidence, figure: Figure, *controls: Figure) -> Finding | None:
     """Return the finding on a board that could not show what a vector saves, else None."""
-    stage = median_stage(evidence, SFT)
-    if _is_too_short(stage, figure):
-        return Finding("cannot be shown here", (figure,), (*controls, stage), (TOO_SHORT,), LONGER)
-    answers = question_drop(evidence, SFT)
-    if loses_no_answers(answers):
-        shown = (*controls, answers)
-        return Finding("cannot be shown here", (figure,), shown, (_why_known(evidence),), A_CAPABILITY)
+    if not_shown := _not_shown(evidence, (figure,), *controls):
+        return not_shown
     if _no_capability(evidence):
-        return Finding("cannot be shown here", (figure,), controls, (NO_CAPABILITY,), A_CAPABILITY)
+        return cannot_be_shown((figure,), controls, [(NO_CAPABILITY, A_CAPABILITY)])
     return None
 
 
@@ -92,22 +102,17 @@ def _not_shown(evidence: Evidence, figure: Figure, *controls: Figure) -> Finding
 def auxiliary_objective_helps(evidence: Evidence) -> Finding:
     """Plain fine-tuning adapts poorly; an auxiliary objective helps but is expensive."""
     steps, time = share_of_steps(evidence, CO_TRAINING, SFT), evidence.step_time(CO_TRAINING)
-    helps, costs, known = steps.high < 0.95, time.low > 1.1, not math.isnan(steps.low)
-    no_help = steps.low > 0.95
-    stage, answers = median_stage(evidence, SFT), question_drop(evidence, SFT)
-    if _is_too_short(stage, steps):
-        return Finding("cannot be shown here", (steps, time), (stage,), (TOO_SHORT,), LONGER)
-    if loses_no_answers(answers):
-        shown = (stage, answers)
-        return Finding("cannot be shown here", (steps, time), shown, (_why_known(evidence),), A_CAPABILITY)
+    helps, costs, no_help = steps.high < 0.95, time.low > 1.1, steps.low > 0.95
+    if not_shown := _not_shown(evidence, (steps, time)):
+        return not_shown
     whether = "It helps." if helps else "It does not help." if no_help else "Whether it helps is open."
     more = ["The steps to the criterion certainly cost more time in all."] if time.low * steps.low > 1 else []
     return Finding(
-        decided(holds=helps and costs, in_part=helps, fails=no_help),
+        decided(holds=helps and costs, in_part=helps and not is_unknown(time), fails=no_help),
         (steps, time),
-        (stage,),
-        (whether, *more) if known else (),
-        what_would_change(steps, 0.95),
+        (median_stage(evidence, SFT),),
+        () if is_unknown(steps) else (whether, *more),
+        what_would_change(*((time, 1.1) if helps and not costs else (steps, 0.95))),
     )
 
 
@@ -129,7 +134,7 @@ def vector_carries_the_capability(evidence: Evidence) -> Finding:
     over_sft, over_random = _of_the_vector(evidence)
     over_objective = share_of_steps(evidence, VECTOR, CO_TRAINING)
     controls = (over_random, over_objective, share_of_steps(evidence, CO_TRAINING, SFT))
-    if not_shown := _not_shown(evidence, over_sft, *controls):
+    if not_shown := _no_vector(evidence, over_sft, *controls):
         return not_shown
     bars = ((over_sft, 0.95), (over_random, 0.95), (over_objective, 1.05))
     failing = [(figure, bar) for figure, bar in bars if figure.low > bar]
@@ -162,7 +167,7 @@ def regulariser_keeps_the_vector(evidence: Evidence) -> Finding:
     """The orthogonal regulariser keeps the merged capability."""
     steps = share_of_steps(evidence, VECTOR, NO_REGULARISER)
     auxiliary = share_of_steps(evidence, CO_TRAINING, SFT)
-    if not_shown := _not_shown(evidence, steps, auxiliary):
+    if not_shown := _no_vector(evidence, steps, auxiliary):
         return not_shown
     return Finding(
         decided(holds=steps.high < 0.95, fails=steps.low > 0.95),
@@ -211,7 +216,7 @@ def costs_little(evidence: Evidence) -> Finding:
 def vector_transfers(evidence: Evidence) -> Finding:
     """The vector transfers to tasks other than those it was made from."""
     over_sft, over_random = _of_the_vector(evidence)
-    if not_shown := _not_shown(evidence, over_random, over_sft):
+    if not_shown := _no_vector(evidence, over_random, over_sft):
         return not_shown
     return Finding(
         decided(holds=over_random.high < 0.95, fails=over_random.low > 0.95),
@@ -251,18 +256,23 @@ def decodes_faster(evidence: Evidence) -> Finding:
     forward = Figure("time of a forward of all tokens / of a block", (), least["forward"])
     holds = speed.low >= LEAST_SPEED_UP and success.low >= -MOST_LOSS
     fails = speed.high < LEAST_SPEED_UP or success.high < -MOST_LOSS
-    change = what_would_change(speed, LEAST_SPEED_UP)
     figures = (speed, success)
     single = min(found.decoders, key=lambda one: one.forwards)
     at_once = Figure(f"success, {single.name} - easy first", (), single.difference, note=pooled)
     controls = (at_once, forward, *_counts(found))
+    reasons = []
     if single.forwards <= 1 and at_once.low >= -MOST_LOSS:
-        why = "One forward succeeds at least as often as 12: a pipeline has nothing to speed up."
-        return Finding("cannot be shown here", figures, controls, (why, PEER), HARDER)
+        reasons.append((AS_GOOD, HARDER))
     if forward.high < LEAST_RATIO:
-        why = "A forward takes as long for all tokens as for a block: only fewer forwards save time here."
-        return Finding("cannot be shown here", figures, controls, (why, PEER), WIDER)
-    return Finding(decided(holds=holds, fails=fails), figures, controls, (PEER,), change)
+        reasons.append((AS_LONG, WIDER))
+    if reasons:
+        return cannot_be_shown(figures, controls, reasons, PEER)
+    bars = ((speed, LEAST_SPEED_UP), (success, -MOST_LOSS))
+    judged = [(one, bar) for one, bar in bars if one.high < bar] or [
+        (one, bar) for one, bar in bars if is_open(one, bar)
+    ]
+    verdict = decided(holds=holds, fails=fails)
+    return Finding(verdict, figures, controls, (PEER,), what_would_change(*(judged or bars)[0]))
 
 
 LEAST_SPEED_UP, MOST_LOSS, LEAST_RATIO = 2.65, 0.03, 1.5
@@ -274,6 +284,8 @@ PEER = (
     "observation is not in this figure."
 )
 
+AS_GOOD = "One forward certainly succeeds at most 0.03 less often than 12: there is nothing to speed up."
+AS_LONG = "A forward takes as long for all tokens as for a block: only fewer forwards save time here."
 HARDER = "Tasks in which actions that are decoded in one forward fail."
 WIDER = "A policy that is wide enough for the time of a forward to follow its tokens."
 

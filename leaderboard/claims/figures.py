@@ -90,6 +90,11 @@ def loses_no_answers(drop: Figure) -> bool:
     return not math.isnan(drop.high) and not drop.low > 0.01
 
 
+def is_unknown(figure: Figure) -> bool:
+    """Return whether a figure has no interval: a rule that asks for it is undecided."""
+    return math.isnan(figure.low) or math.isnan(figure.high)
+
+
 def answer_curve(evidence: Evidence, method: str) -> list[Figure]:
     """Return the drop in question accuracy after each evaluated step of the first target."""
     first = evidence.first_run(method)
@@ -194,14 +199,18 @@ def sparsity(evidence: Evidence, method: str, other: str) -> Figure:
 
 
 def drift_ratio(evidence: Evidence, method: str) -> Figure:
-    """Return the activation drift divided by sft's, geometric mean over seeds."""
+    """Return how far hidden states move, divided by sft's, geometric mean over seeds.
+
+    The recorded drift is a squared distance.
+    """
 
     def ratio(of: Of) -> Array:
         part, whole = (of[label].activation_drift[..., -1, -1] for label in (method, "sft"))
         with np.errstate(divide="ignore"):  # a policy that stays the same has a drift of 0
-            return np.exp(average(np.log(part / np.where(whole > 0, whole, np.nan))))
+            return np.exp(average(np.log(part / np.where(whole > 0, whole, np.nan))) / 2)
 
-    return evidence.figure(f"activation drift, {method} / sft", ratio, method, "sft", ratio=True)
+    what = f"distance that training moves the hidden states of questions, {method} / sft"
+    return evidence.figure(what, ratio, method, "sft", ratio=True)
 
 
 RANDOM = "aegis+direction=random"
@@ -223,7 +232,7 @@ ENDS = {"before the first step": 0, "at the end of the first stage": -1}
 
 
 def anchor_distance(evidence: Evidence, method: str, end: str) -> Figure:
-    """Return the squared distance of a batch to AEGIS's anchor at one of `ENDS`, mean over seeds."""
+    """Return the distance of a batch to AEGIS's anchor at one of `ENDS`, mean over seeds."""
     what = f"distance of a batch to the anchor {end}, {method}"
 
     def read(stages: Sequence[Mapping[str, Any]]) -> float | None:
@@ -234,11 +243,14 @@ def anchor_distance(evidence: Evidence, method: str, end: str) -> Figure:
 
 
 def _distance(diagnostics: Mapping[str, Any], place: int) -> float:
-    """Return one of the distances of a batch to the anchor in the first stage, NaN if there is none."""
+    """Return one of the distances of a batch to the anchor in the first stage, NaN if there is none.
+
+    Records have the squared distance.
+    """
     found = diagnostics.get("1")
     values = found.get("anchor_distance") if isinstance(found, dict) else None
     value: Any = values[place] if isinstance(values, list) and values else None
-    return float(value) if is_number(value) and value > 0 else math.nan
+    return math.sqrt(value) if is_number(value) and value > 0 else math.nan
 
 
 def median_stage(evidence: Evidence, method: str) -> Figure:

@@ -62,6 +62,10 @@ def judged(identifier: str, given: Given, runs: dict[str, Any] | None = None) ->
     return finding
 
 
+FORGETS: Given = {"question accuracy, pretrained - sft@1 after the last target": (0.011, 0.1)}
+"""Plain fine-tuning certainly loses answers at the scenario's learning rate."""
+
+
 def shares(consft: float, calibrated: float) -> Given:
     """Return the shares of the weights of both arms that differ between samples."""
     what = "share of the weights of {} between 0.01 and 0.9, first nine tenths of the schedule"

@@ -28,3 +28,68 @@ def test_a_claim_fails_only_if_the_arm_that_does_not_count_fails_too(
     assert finding.verdict == verdict
     shown = {figure.what: figure.high for figure in (*finding.figures, *finding.controls)}
     assert shown[what.format("consft_calibrated")] == other[1]
+
+
+BOTH_COUNT, NONE_COUNTS = shares(0.2, 0.2), shares(0.05, 0.05)
+
+
+@pytest.mark.parametrize(
+    ("replay", "buffered", "verdict", "change"),
+    [
+        ((-0.04, 0.02), (-0.049, 0.1), "holds", '- buffered_replay" would have to move by 0.00'),
+        ((0.04, 0.2), (-0.2, 0.3), "undecided", '- buffered_replay" contains -0.05'),
+        (None, (-0.4, -0.2), "does not hold", '- buffered_replay" would have to move by 0.15'),
+        ((0.0, 0.1), None, "undecided", "Records that give an interval for this figure: retained success, "),
+    ],
+)
+def test_the_kind_of_replay_that_decides_is_named_whatever_is_known_of_the_other(
+    replay: Ends | None, buffered: Ends | None, verdict: str, change: str
+) -> None:
+    kinds = (("experience_replay", replay), ("buffered_replay", buffered))
+    given = {key: ends for name, one in kinds if one for key, ends in kept(one, one, name).items()}
+    finding = judged("C3", {**BOTH_COUNT, **given})
+    assert finding.verdict == verdict
+    assert change in finding.change
+    fails = "buffered_replay certainly keeps more skills than consft." in finding.sentences
+    assert fails == (verdict == "does not hold")
+
+
+def test_an_arm_that_does_not_count_and_keeps_a_claim_from_failing_is_named_as_such() -> None:
+    given = {**shares(0.05, 0.2), **kept((0.25, 0.35), (0.0, 0.1)), **kept((0.0, 0.1), (0.0, 0.1), rung="@1")}
+    finding = judged("C2", given)
+    assert finding.verdict == "undecided"
+    assert (
+        finding.change
+        == 'An interval of "retained success, consft - sft" below 0.20: its arm does not count.'
+    )
+
+
+def test_where_the_larger_gain_is_open_the_one_that_makes_a_claim_hold_is_explained() -> None:
+    finding = judged("C2", {**BOTH_COUNT, **kept((-0.1, 0.7), (0.21, 0.29))})
+    assert finding.verdict == "holds"
+    assert finding.figures[0].methods[0] == "consft_calibrated"
+    assert not [one for one in finding.sentences if "no gain to explain" in one]
+
+
+@pytest.mark.parametrize(
+    ("identifier", "given", "change"),
+    [
+        ("C4", {"update sparsity, sft@0.03 - sft@1": (0.0, 0.01)}, "A measure of sparsity that responds"),
+        ("C8", {"success on new targets, plain - perturbed, sft": (0.0, 0.01)}, "Starts farther from"),
+    ],
+)
+def test_each_reason_why_a_claim_cannot_be_shown_says_what_would_remove_it(
+    identifier: str, given: Given, change: str
+) -> None:
+    finding = judged(identifier, {**NONE_COUNTS, **given})
+    assert finding.verdict == "cannot be shown here"
+    assert "Weights that differ between samples" in finding.change
+    assert change in finding.change
+
+
+@pytest.mark.parametrize(
+    ("time", "bar"), [((1.21, 1.7), "1.60"), ((1.1, 1.4), "1.20"), ((1.61, 1.9), "1.60")]
+)
+def test_a_time_of_a_step_is_compared_with_the_bar_that_decides(time: Ends, bar: str) -> None:
+    change = judged("A7", {"time of aegis": time}).change
+    assert change.endswith((f"contains {bar}.", f"to reach {bar}."))

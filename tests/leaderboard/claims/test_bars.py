@@ -4,7 +4,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from stated_evidence import Ends, Figure, Given, Stated, judged, kept, shares
+from stated_evidence import FORGETS, Ends, Figure, Given, Stated, judged, kept, shares
 
 from clbench.scoring.intervals import Estimate
 
@@ -193,7 +193,7 @@ CASES: list[tuple[str, str, Given]] = [
             verdict,
             {
                 "distance of a batch to the anchor, aegis / aegis+direction=random": ratio,
-                "activation drift, aegis / sft": drift,
+                "distance that training moves the hidden states of questions, aegis / sft": drift,
             },
         )
         for ratio, drift, verdict in (
@@ -399,14 +399,14 @@ def test_a_saving_of_steps_counts_from_a_twentieth_on(
 ) -> None:
     stage = Figure("median", ("sft@1",), Estimate(median, None, None))
     monkeypatch.setattr(f"{MODULE}.fast_dvla.median_stage", lambda *_: stage)
-    assert judged(identifier, given).verdict == verdict
+    assert judged(identifier, {**FORGETS, **given}).verdict == verdict
 
 
 def test_a_random_vector_that_is_as_good_decides_on_the_vector(monkeypatch: pytest.MonkeyPatch) -> None:
     stage = Figure("median", ("sft@1",), Estimate(20, None, None))
     monkeypatch.setattr(f"{MODULE}.fast_dvla.median_stage", lambda *_: stage)
-    assert f'"{RANDOM}"' in judged("F2", {**REPLACED, VECTOR: FAST, RANDOM: SLOW}).change
-    assert f'"{VECTOR}"' in judged("F2", {**REPLACED, VECTOR: SLOW, RANDOM: FAST}).change
+    assert f'"{RANDOM}"' in judged("F2", {**FORGETS, **REPLACED, VECTOR: FAST, RANDOM: SLOW}).change
+    assert f'"{VECTOR}"' in judged("F2", {**FORGETS, **REPLACED, VECTOR: SLOW, RANDOM: FAST}).change
 
 
 @pytest.mark.parametrize(("time", "says"), [((1.06, 1.2), True), ((1.04, 1.2), False)])
@@ -415,7 +415,7 @@ def test_steps_are_said_to_cost_more_time_in_all_only_where_both_lower_ends_do(
 ) -> None:
     stage = Figure("median", ("sft@1",), Estimate(20, None, None))
     monkeypatch.setattr(f"{MODULE}.fast_dvla.median_stage", lambda *_: stage)
-    finding = judged("F1", {SFT_STEPS.format(CO_TRAINING): SLOW, f"time of {CO_TRAINING}": time})
+    finding = judged("F1", {**FORGETS, SFT_STEPS.format(CO_TRAINING): SLOW, f"time of {CO_TRAINING}": time})
     assert ("The steps to the criterion certainly cost more time in all." in finding.sentences) is says
 
 

@@ -201,8 +201,8 @@ def test_a_gain_that_a_control_shares_is_not_put_down_to_the_weights(bench: Benc
         bench.add(label, earlier=0.9)
     bench.add("finch", earlier=0.2)
     assert (
-        "sft at its best learning rate does not reach it, but constant_weight and shuffled_weights are not "
-        "told apart from it: weighing samples need not be the cause."
+        "sft at its best learning rate certainly keeps fewer, but constant_weight and shuffled_weights do "
+        "not: weighing samples need not be the cause."
     ) in section(bench.page(), "C7")
 
 
