@@ -93,7 +93,7 @@ def tune(
     check_names([scenario], methods)
     from clbench.learning.registry import load_method
     from clbench.runs.spec import RunSpec, check_device
-    from clbench.runs.tuning import CONTROL_OF, check_tuned, rungs, tuned_file, write_tuned
+    from clbench.runs.tuning import CONTROL_OF, check_tuned, rungs
 
     if targets is not None:  # a run of fewer targets must not replace the record of all
         records = records / f"targets-{targets}"
@@ -109,17 +109,7 @@ def tune(
         )
         table = table_name(without_module(scenario), policy)
         names = chosen_methods(methods, every)
-        if targets is not None and not values:
-            raise InputError("--targets needs --values: settings are chosen on all targets.")
-        if write is not None and values:
-            raise InputError("--write cannot be used with --values: it needs a choice of settings.")
-        if write is not None and first_seed < FIRST_TUNING_SEED:
-            raise InputError(
-                f"--write needs seeds that no board has: --first-seed must be at least {FIRST_TUNING_SEED}, "
-                f"not {first_seed}."
-            )
-        if fixed and values:
-            raise InputError("--set cannot be used with --values: give the value as --values.NAME.")
+        _check_together(fixed, values, targets, write, first_seed)
         if not values:  # their runs would choose settings that no run reads
             names = _without_controls(names, CONTROL_OF, every)
         check_device(device)
@@ -136,21 +126,52 @@ def tune(
     chosen = _choose(classes, ladder, run)
     Console().print(_table(table, {name: (one.settings, one.tried) for name, one in chosen.items()}, seeds))
     if write is not None:
-        with checked_input():
-            write_tuned(write, table, numbers, chosen)
-        read = tuned_file(table)
-        if write.resolve() != read.resolve():
-            how = (
-                f"repeat this command with --write {read}, which keeps its other methods"
-                if read.exists()
-                else f"copy {write} there"
-            )
-            told = f"`clbench run` reads {read}: {how}, on every machine that runs or shows these records."
-            print_plain(Console(stderr=True), told)
+        _write(write, table, numbers, chosen)
     if len(chosen) < len(names):
         without = ", ".join(name for name in names if name not in chosen)
         print_plain(Console(stderr=True), f"Failed at every learning rate: {without}.", "bold red")
         sys.exit(1)
+
+
+def _check_together(
+    fixed: Mapping[str, str] | None,
+    values: Mapping[str, str] | None,
+    targets: int | None,
+    write: Path | None,
+    first_seed: int,
+) -> None:
+    """Refuse options of `tune` that contradict each other.
+
+    Raises:
+        InputError: Two of them do; the message names both.
+    """
+    if targets is not None and not values:
+        raise InputError("--targets needs --values: settings are chosen on all targets.")
+    if write is not None and values:
+        raise InputError("--write cannot be used with --values: it needs a choice of settings.")
+    if write is not None and first_seed < FIRST_TUNING_SEED:
+        raise InputError(
+            f"--write needs seeds that no board has: --first-seed must be at least {FIRST_TUNING_SEED}, "
+            f"not {first_seed}."
+        )
+    if fixed and values:
+        raise InputError("--set cannot be used with --values: give the value as --values.NAME.")
+
+
+def _write(path: Path, table: str, seeds: Sequence[int], chosen: Mapping[str, Tuned]) -> None:
+    """Write the chosen settings, and say how `clbench run` gets them unless it reads this file."""
+    from clbench.runs.tuning import tuned_file, write_tuned
+
+    with checked_input():
+        write_tuned(path, table, seeds, chosen)
+    read = tuned_file(table)
+    if path.resolve() == read.resolve():
+        return
+    how = f"copy {path} there"
+    if read.exists():
+        how = f"repeat this command with --write {read}, which keeps its other methods"
+    told = f"`clbench run` reads {read}: {how}, on every machine that runs or shows these records."
+    print_plain(Console(stderr=True), told)
 
 
 def _choose(
