@@ -78,7 +78,7 @@ records: .venv/installed-libero
 	$(BIN)/clbench run clbench/MetaWorld-v1 $(REFERENCES) $(METHODS) $(CONSFT_CONTROLS) --seeds 8
 	$(BIN)/clbench run clbench/PointMaze-v1 $(REFERENCES) $(MAZE) $(CONSFT_CONTROLS) --seeds 4
 	$(BIN)/clbench run $(KNOWLEDGE) frozen joint sft stop_gradient aegis lora --seeds 4
-	$(BIN)/clbench run clbench/LiberoSpatial-v1 experience_replay from_scratch frozen joint sft --seeds 4
+	$(BIN)/clbench run clbench/LiberoSpatial-v1 $(SCHEDULED) experience_replay from_scratch frozen joint sft --seeds 4
 	$(BIN)/clbench run clbench/Fetch-v1 frozen sft consft aegis experience_replay lora stop_gradient --seeds 3 \
 		--policy discrete_diffusion
 	$(BIN)/clbench run clbench/Fetch-v1 sft experience_replay lora --seeds 1 --policy flow-base
@@ -92,7 +92,7 @@ records: .venv/installed-libero
 # claims need consft_calibrated at the scenario's own learning rate only. On Fetch-v1, tuning rated plain fine-tuning at
 # 0.1 as highly as at 0.3, the first: a gain is certain only if it is over both.
 LADDER = $(BIN)/clbench run $(BOTH) $(filter-out consft_calibrated,$(METHODS)) --seeds 4 --records leaderboard/ladder
-ladder: .venv/installed-dev
+ladder: .venv/installed-libero
 	$(LADDER) --set.step_factor 1
 	$(LADDER) --set.step_factor 0.3
 	$(LADDER) --set.step_factor 0.1
@@ -100,6 +100,7 @@ ladder: .venv/installed-dev
 	$(BIN)/clbench run clbench/Fetch-v1 sft --set.step_factor 0.1 --seeds 12 --records leaderboard/ladder
 	$(BIN)/clbench run $(CLAIMED) consft_calibrated --set.step_factor 1 --seeds 4 --records leaderboard/ladder
 	$(BIN)/clbench run clbench/PointMaze-v1 sft consft fast_dvla --set.step_factor 1 --seeds 4 --records leaderboard/ladder
+	$(BIN)/clbench run clbench/LiberoSpatial-v1 sft $(SCHEDULED) --set.step_factor 1 --seeds 4 --records leaderboard/ladder
 
 # Further records for docs/reference/claims.md: methods with one change that shows what causes their effect.
 KNOWLEDGE := clbench/FetchKnowledge-v1
