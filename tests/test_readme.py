@@ -107,11 +107,14 @@ def test_the_readme_states_how_many_claims_there_are_and_how_many_are_decided() 
     claims = resolve("clbench.leaderboard.claims.judges:CLAIMS")
     rows = re.findall(r"^\| \[(\w+)\].*? \| .*? \| .*? \| (.*?) \|", CLAIMS.read_text("utf-8"), re.MULTILINE)
     assert {identifier for identifier, _ in rows} == set(claims)
-    decided = {identifier for identifier, verdict in rows if verdict.startswith(("holds", "does not hold"))}
     papers = {identifier for identifier, claim in claims.items() if not claim.uncounted}
+    hold, in_part, fail = (
+        len({identifier for identifier, found in rows if found == verdict} & papers)
+        for verdict in ("holds", "holds in part", "does not hold")
+    )
     text = " ".join(README.read_text(encoding="utf-8").split())
     stated = (
-        f"judge {len(papers)} statements of papers; {len(decided & papers)} of them are decided on at least "
-        "one board"
+        f"judge {len(papers)} statements of papers. On at least one board, {hold} hold, {in_part} hold in part, "
+        f"and {fail} do not hold."
     )
     assert stated in text
