@@ -158,7 +158,7 @@ def _row(
         letters=letters,
         tier=min((run.tier for run in members), key=TIERS.index),
         seeds=tuple(run.seed for run in members),
-        to_criterion=first.published.budget.get("criterion") is not None,
+        to_criterion=first.scores.layout.to_criterion,
         estimates=estimates,
         costs=costs_of(members, by_method.get(BASELINE, [])),
         order_sensitivity=orders.sensitivity,

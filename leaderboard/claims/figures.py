@@ -187,17 +187,6 @@ def _without_impossible(scores: Scores) -> Scores:
     return replace(scores, perturbed=perturbed)
 
 
-def sparsity(evidence: Evidence, method: str, other: str) -> Figure:
-    """Return the difference in update sparsity after the last target."""
-
-    def difference(of: Of) -> Array:
-        first, second = (of[label].update_sparsity[..., -1, -1] for label in (method, other))
-        return average(first - second)
-
-    what = f"update sparsity, {method} - {other}"
-    return evidence.figure(what, difference, method, other, span=(-1, 1), form=".3f")
-
-
 def drift_ratio(evidence: Evidence, method: str) -> Figure:
     """Return how far hidden states move, divided by sft's, geometric mean over seeds.
 

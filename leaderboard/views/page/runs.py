@@ -94,7 +94,7 @@ class Runs:
     @property
     def to_criterion(self) -> bool:
         """Whether their stages end when the target is learned."""
-        return self.records[0].scenario.budget.get("criterion") is not None
+        return self.layout.to_criterion
 
     def curves(self) -> Mapping[str, Sequence[Estimate]]:
         """Return the points of `SERIES`, but for the last, with intervals."""
