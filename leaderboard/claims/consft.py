@@ -42,6 +42,7 @@ from .consft_controls import (
 from .evidence import Evidence, Figure, rung
 from .figures import (
     PUBLISHED,
+    is_unknown,
     kept,
     retention_drop,
     share_afterwards,
@@ -149,10 +150,13 @@ def keeps_20_points_more(evidence: Evidence) -> Finding:
             *what_controls_say(best, controls, arms),
             *at_one_says,
         ),
-        change_of_arms(verdict, may_hold, every, 0.20),
+        change_of_arms(verdict, may_hold, every, 0.20) + (ONE_SIDED if any(map(is_unknown, at_one)) else ""),
         about=ARMS,
     )
 
+
+ONE_SIDED = " Without runs of both arms at the scenario's learning rate, the claim can hold, but not fail."
+"""What C2 lacks on a board without these."""
 
 KEEPS_TOO_MUCH = (
     "sft keeps too much for a gain of 0.20.",

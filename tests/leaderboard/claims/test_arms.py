@@ -64,6 +64,15 @@ def test_an_arm_that_does_not_count_and_keeps_a_claim_from_failing_is_named_as_s
     )
 
 
+@pytest.mark.parametrize("ladder", [True, False])
+def test_a_board_that_could_only_confirm_a_gain_says_so(ladder: bool) -> None:
+    both = (-0.2, 0.1)
+    given = {**BOTH_COUNT, **kept(both, both), **(kept(both, both, rung="@1") if ladder else {})}
+    finding = judged("C2", given)
+    assert finding.verdict == ("does not hold" if ladder else "undecided")
+    assert finding.change.endswith("the claim can hold, but not fail.") != ladder
+
+
 def test_where_the_larger_gain_is_open_the_one_that_makes_a_claim_hold_is_explained() -> None:
     finding = judged("C2", {**BOTH_COUNT, **kept((-0.1, 0.7), (0.21, 0.29))})
     assert finding.verdict == "holds"
