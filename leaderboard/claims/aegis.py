@@ -34,7 +34,6 @@ from .figures import (
     answer_curve,
     drift_ratio,
     early_success,
-    is_unknown,
     learning_curve,
     loses_no_answers,
     question_drop,
@@ -126,17 +125,18 @@ def stop_gradient_keeps_and_wastes(evidence: Evidence) -> Finding:
     of_sft = question_drop(evidence, "sft")
     if loses_no_answers(of_sft):
         return _by_steps(share_of_steps(evidence, "stop_gradient@1", "sft@1"), (early, answers, of_sft))
+    if of_sft.is_unknown:
+        return Finding("undecided", (early, answers), (of_sft,), change=what_would_change(of_sft, 0.01))
     by_answers = answers.low > 0.01 or early.high < -0.05
-    verdict = decided(
-        holds=answers.high < 0.01 and early.high < -0.05, fails=answers.low > 0.01 or early.low > -0.05
-    )
-    deciding_one = (answers, 0.01) if by_answers else (early, -0.05)
     return Finding(
-        "undecided" if is_unknown(of_sft) else verdict,
+        decided(
+            holds=answers.high < 0.01 and early.high < -0.05,
+            fails=answers.low > 0.01 or early.low > -0.05,
+        ),
         (early, answers),
         (of_sft,),
         (),
-        what_would_change(*((of_sft, 0.01) if is_unknown(of_sft) else deciding_one)),
+        what_would_change(*((answers, 0.01) if by_answers else (early, -0.05))),
     )
 
 
@@ -230,7 +230,7 @@ def keeps_answers(evidence: Evidence) -> Finding:
     if loses_no_answers(of_sft):
         return Finding("cannot be shown here", (aegis,), (sft, *gains), (NOTHING_TO_KEEP,), LOSES_ANSWERS)
     return Finding(
-        "undecided" if is_unknown(of_sft) else decided(holds=aegis.low >= -0.01, fails=aegis.high < -0.01),
+        "undecided" if of_sft.is_unknown else decided(holds=aegis.low >= -0.01, fails=aegis.high < -0.01),
         (aegis,),
         (sft, *gains, *answer_curve(evidence, "aegis")),
         (
@@ -250,7 +250,7 @@ def keeps_answers(evidence: Evidence) -> Finding:
                 does_not="the anchor's direction matters",
             ),
         ),
-        what_would_change(*((of_sft, 0.01) if is_unknown(of_sft) else (aegis, -0.01))),
+        what_would_change(*((of_sft, 0.01) if of_sft.is_unknown else (aegis, -0.01))),
     )
 
 

@@ -50,6 +50,11 @@ def inactive_sentences(evidence: Evidence) -> tuple[str, ...]:
     )
 
 
+def inactive_reasons(evidence: Evidence, counting: Sequence[str]) -> list[tuple[str, str]]:
+    """Return these sentences as reasons for `cannot_be_shown`, which they are only if no arm counts."""
+    return [(why, "" if counting else NEEDS_WEIGHTS) for why in inactive_sentences(evidence)]
+
+
 def _afterwards(evidence: Evidence, arm: str) -> str:
     """Return how much of the training the rule on weights leaves out: a stage may outlast the schedule."""
     later = share_afterwards(evidence, arm)
@@ -112,11 +117,10 @@ def without_an_arm(
         reasons: Further reasons, as in `cannot_be_shown`.
     """
     shares = tuple(one(evidence, arm) for arm in ARMS for one in (share_between, share_afterwards))
-    inactive = inactive_sentences(evidence)
     return cannot_be_shown(
         best_first(figures),
         (*controls, *shares),
-        [*((why, NEEDS_WEIGHTS) for why in inactive), *reasons],
+        [*inactive_reasons(evidence, ()), *reasons],
         *(if_all_counted((), "cannot be shown here", of_all) if of_all is not None else ()),
         about=ARMS,
     )

@@ -151,21 +151,20 @@ def cannot_be_shown(
     Args:
         figures: Figures of the rule.
         controls: Other figures.
-        reasons: Why it cannot be shown, each with what would remove the reason: all must go. A sentence that
-            is no reason has an empty one.
+        reasons: Why it cannot be shown, each with what would remove the reason; all must go. The second text
+            is empty for a sentence that gives no reason.
         more: Further sentences.
         about: See `Finding.about`.
     """
     why, changes = zip(*reasons, strict=True)
-    every = (*dict.fromkeys(filter(None, why)), *more)
     change = " ".join(dict.fromkeys(filter(None, changes)))
-    return Finding("cannot be shown here", tuple(figures), tuple(controls), every, change, about)
+    return Finding("cannot be shown here", tuple(figures), tuple(controls), (*why, *more), change, about)
 
 
 def what_would_change(figure: Figure, bar: float) -> str:
     """Return the sentence that says how far the interval of the deciding figure is from the rule's bar."""
     interval = f'interval of "{figure.what}"'
-    if math.isnan(figure.low) or math.isnan(figure.high):
+    if figure.is_unknown:
         return f"Records that give an interval for this figure: {figure.what}."
     apart = max(figure.low - bar, bar - figure.high)
     form = figure.form
@@ -189,7 +188,7 @@ def deciding(verdict: Verdict, figures: Sequence[Figure], bar: float) -> Figure:
         figures: Figures of the rule, the largest first: an open rule hangs on it.
         bar: Bar of the rule.
     """
-    known = [figure for figure in figures if not math.isnan(figure.low)]
+    known = [figure for figure in figures if not figure.is_unknown]
     if verdict == "does not hold":
         return max(known, key=lambda figure: figure.high)
     if verdict in ("holds", "holds in part"):
@@ -222,7 +221,7 @@ def _seeds_for(reach: float, half: float, seeds: int) -> int | None:
 def not_told_apart(control: Figure, name: str = "", *, explains: str, does_not: str) -> str:
     """Return what a control says: the figure is the method's gain over the control, higher is better."""
     method, name = control.methods[0], name or control.methods[1]
-    if math.isnan(control.low):
+    if control.is_unknown:
         return f"The records cannot show what {name} says about {method}."
     if control.low > 0:
         return f"{name} does not reach {method}: {does_not}."

@@ -11,10 +11,10 @@ from typing import Any
 from ..board.runs import is_number
 from .arms import (
     ARMS,
-    NEEDS_WEIGHTS,
     arms_that_count,
     change_of_arms,
     if_all_counted,
+    inactive_reasons,
     inactive_sentences,
     rises_above,
     without_an_arm,
@@ -42,7 +42,6 @@ from .consft_controls import (
 from .evidence import Evidence, Figure, rung
 from .figures import (
     PUBLISHED,
-    is_unknown,
     kept,
     retention_drop,
     share_afterwards,
@@ -83,7 +82,7 @@ def sft_degrades(evidence: Evidence) -> Finding:
 
 def _what_joint_says(gain: Figure, learned: Figure) -> tuple[str, ...]:
     """Return whether training on all data keeps more than sft at its learning rate; nothing if unknown."""
-    if math.isnan(gain.low):
+    if gain.is_unknown:
         return ()
     if gain.low > 0:
         return (
@@ -134,23 +133,22 @@ def keeps_20_points_more(evidence: Evidence) -> Finding:
     shown = (*sft, *alike, *controls, *controls_at_one, *shares)
     at_one_says = what_the_full_rate_says(best_first(at_one)[0], controls_at_one)
     may_hold = {"holds": counting, "holds in part": published}.get(verdict, [*counting, *published])
-    inactive = inactive_sentences(evidence)
     if not arms or keeps_too_much:
-        reasons = [(why, "" if arms else NEEDS_WEIGHTS) for why in inactive]
-        reasons += [KEEPS_TOO_MUCH] if keeps_too_much else []
+        reasons = [*inactive_reasons(evidence, arms), *([KEEPS_TOO_MUCH] if keeps_too_much else [])]
         if_they_did = if_all_counted(arms, "cannot be shown here", of_all) if not keeps_too_much else ()
         return cannot_be_shown(figures, shown, reasons, *if_they_did, *at_one_says)
+    one_sided = ONE_SIDED if any(one.is_unknown for one in at_one) else ""
     return Finding(
         verdict,
         figures,
         shown,
         (
-            *inactive,
+            *inactive_sentences(evidence),
             *if_all_counted(arms, verdict, of_all),
             *what_controls_say(best, controls, arms),
             *at_one_says,
         ),
-        change_of_arms(verdict, may_hold, every, 0.20) + (ONE_SIDED if any(map(is_unknown, at_one)) else ""),
+        change_of_arms(verdict, may_hold, every, 0.20) + one_sided,
         about=ARMS,
     )
 
@@ -300,8 +298,8 @@ def stays_sparse(evidence: Evidence) -> Finding:
         return without_an_arm(evidence, list(every.values()), controls, None, *reasons)
     figures = best_first(arms)
     if reasons:
-        inactive = [(why, "") for why in inactive_sentences(evidence)]
-        return cannot_be_shown(figures, controls, [*inactive, *reasons], about=ARMS)
+        every_reason = [*inactive_reasons(evidence, counting), *reasons]
+        return cannot_be_shown(figures, controls, every_reason, about=ARMS)
     responds = response.high >= 0.05  # not known without records
     verdict, of_all = (
         rises_above(0.05, some, every.values()) if responds else "undecided"

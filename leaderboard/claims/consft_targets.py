@@ -11,6 +11,7 @@ from .arms import (
     arms_that_count,
     change_of_arms,
     if_all_counted,
+    inactive_reasons,
     inactive_sentences,
     rises_above,
     without_an_arm,
@@ -129,8 +130,8 @@ def prevents_spatial_overfitting(evidence: Evidence) -> Finding:
     if not arms:
         return without_an_arm(evidence, every, (of_sft,), None, *reasons)
     if reasons:
-        inactive = [(why, "") for why in inactive_sentences(evidence)]
-        return cannot_be_shown(best_first(every), (of_sft,), [*inactive, *reasons], about=ARMS)
+        every_reason = [*inactive_reasons(evidence, counting), *reasons]
+        return cannot_be_shown(best_first(every), (of_sft,), every_reason, about=ARMS)
     verdict = rises_above(0.05, arms, every)
     return Finding(
         verdict,

@@ -78,6 +78,11 @@ class Figure:
         """Upper end of the interval, NaN if none describes other seeds."""
         return self._end(self.estimate.high)
 
+    @property
+    def is_unknown(self) -> bool:
+        """Whether no interval describes other seeds: a rule that asks for the figure is undecided."""
+        return math.isnan(self.low) or math.isnan(self.high)
+
     def _end(self, end: float | None) -> float:
         return math.nan if end is None or not self.estimate.of_seeds else end
 

@@ -13,7 +13,7 @@ from clbench.scoring.intervals import NO_ESTIMATE, Estimate
 from ..policies.decoders import Decoding, read_decoding
 from .claim import ANYWHERE, Finding, Paper, cannot_be_shown, claim, decided, is_open, what_would_change
 from .evidence import Evidence, Figure, rung
-from .figures import PUBLISHED, is_unknown, loses_no_answers, median_stage, question_drop, share_of_steps
+from .figures import PUBLISHED, loses_no_answers, median_stage, question_drop, share_of_steps
 
 CAPVECTOR = Paper("CapVector (the abstract of Fast-dVLA)", ("2603.25661", "2605.10903"))
 FAST_DVLA = Paper("Fast-dVLA's body", ("2603.25661",))
@@ -44,7 +44,7 @@ LONGER = "Targets that take plain fine-tuning at least 20 steps at the scenario'
 
 def _is_too_short(stage: Figure, steps: Figure) -> bool:
     """Return whether stages are too short for the open question whether 5 % of the steps are saved."""
-    return stage.value < FEWEST_STEPS and is_open(steps, 0.95) and not is_unknown(steps)
+    return stage.value < FEWEST_STEPS and is_open(steps, 0.95) and not steps.is_unknown
 
 
 def _no_capability(evidence: Evidence) -> bool:
@@ -72,7 +72,7 @@ def _not_shown(evidence: Evidence, figures: Sequence[Figure], *controls: Figure)
     reasons += [(_why_known(evidence), A_CAPABILITY)] if loses_no_answers(answers) else []
     if reasons:
         return cannot_be_shown(figures, (*controls, stage, answers), reasons)
-    if is_unknown(answers):
+    if answers.is_unknown:
         return Finding("undecided", tuple(figures), controls, (), what_would_change(answers, 0.01))
     return None
 
@@ -108,10 +108,10 @@ def auxiliary_objective_helps(evidence: Evidence) -> Finding:
     whether = "It helps." if helps else "It does not help." if no_help else "Whether it helps is open."
     more = ["The steps to the criterion certainly cost more time in all."] if time.low * steps.low > 1 else []
     return Finding(
-        decided(holds=helps and costs, in_part=helps and not is_unknown(time), fails=no_help),
+        decided(holds=helps and costs, in_part=helps and not time.is_unknown, fails=no_help),
         (steps, time),
         (median_stage(evidence, SFT),),
-        () if is_unknown(steps) else (whether, *more),
+        () if steps.is_unknown else (whether, *more),
         what_would_change(*((time, 1.1) if helps and not costs else (steps, 0.95))),
     )
 

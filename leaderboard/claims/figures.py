@@ -87,12 +87,7 @@ def question_drop(evidence: Evidence, method: str) -> Figure:
 
 def loses_no_answers(drop: Figure) -> bool:
     """Return whether the drop in question accuracy was measured, and is not certainly above 0.01."""
-    return not math.isnan(drop.high) and not drop.low > 0.01
-
-
-def is_unknown(figure: Figure) -> bool:
-    """Return whether a figure has no interval: a rule that asks for it is undecided."""
-    return math.isnan(figure.low) or math.isnan(figure.high)
+    return not drop.is_unknown and not drop.low > 0.01
 
 
 def answer_curve(evidence: Evidence, method: str) -> list[Figure]:

@@ -68,8 +68,8 @@ def _missing(one: Judged) -> list[str]:
     return lines
 
 
-def _checked(one: Judged) -> str:
-    """Return how many of the records behind the figures of a finding were replayed or trained again."""
+def _checked(one: Judged) -> list[str]:
+    """Return how many records behind a finding were replayed or repeated; nothing if there are none."""
     read = {
         (label, seed)
         for figure in (*one.finding.figures, *one.finding.controls)
@@ -79,10 +79,10 @@ def _checked(one: Judged) -> str:
     runs = one.evidence.runs
     tiers = [runs[label][seed].tier for label, seed in read if seed in runs.get(label, {})]
     if not tiers:
-        return ""
+        return []
     counts = ((tiers.count(tier), words) for tier, words in CHECKS.items())
     done = listed([words.format(count) for count, words in counts if count]) or "replayed none"
-    return f"Of the {counted(len(tiers), 'record')} behind the figures, another process {done}."
+    return [f"Of the {counted(len(tiers), 'record')} behind the figures, another process {done}."]
 
 
 def figure_text(figure: Figure) -> str:
