@@ -11,6 +11,8 @@ from clbench.scoring.metric import TIE
 
 REPLICATES = 2000
 """Bootstrap draws of seeds."""
+ORDERS = 20_000
+"""Random orders of the rows in Kendall's test where rows tie: p is known to 0.002 at 0.05."""
 
 SIGNIFICANCE = 0.05
 """Largest probability of an agreement that is not put down to chance."""
@@ -81,10 +83,25 @@ def kendall_tau(one: Array, other: Array) -> Array:
 
 
 def chance_of(one: Array, other: Array) -> float:
-    """Return the two-sided probability of Kendall's test that values (rows,) and others are unrelated."""
-    from scipy.stats import kendalltau  # a second, which reading a board does not need
+    """Return the two-sided probability of Kendall's test that values (rows,) and others are unrelated.
 
-    return float(kendalltau(one.round(9), other.round(9)).pvalue)
+    Without ties it is exact. With ties SciPy has only the normal approximation, which gave 0.11 and 0.28 for
+    10 rows where 40,000 random orders gave 0.13 and 0.33; random orders then stand for all.
+    """
+    from scipy.stats import kendalltau, permutation_test  # a second, which reading a board does not need
+
+    first, second = one.round(9), other.round(9)
+    if len(np.unique(first)) == len(first) and len(np.unique(second)) == len(second):
+        return float(kendalltau(first, second).pvalue)
+
+    def tau(orders: Array, axis: int) -> Array:
+        assert axis == -1
+        return kendall_tau(orders, np.broadcast_to(second, orders.shape))
+
+    test = permutation_test(
+        (first,), tau, permutation_type="pairings", vectorized=True, n_resamples=ORDERS, axis=-1, rng=0
+    )
+    return float(test.pvalue)
 
 
 def _signs(differences: Array) -> Array:

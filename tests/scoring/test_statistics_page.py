@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from clbench import read_record
 from clbench.cli.runs import run as run_command
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
@@ -24,6 +25,8 @@ from clbench.scoring.expected_precision import (
 )
 from clbench.scoring.groups import UNKNOWN_DEVIATION
 from clbench.scoring.intervals import REPLICATES
+from clbench.scoring.metrics import measure
+from clbench.scoring.scores import Scores
 from clbench.testing import TOY
 
 ROOT = Path(__file__).parents[2]
@@ -69,6 +72,30 @@ def test_the_deviations_between_seeds_are_those_of_the_committed_records(
 ) -> None:
     for name, of_metrics in results["records"].items():
         assert coverage.seed_deviations(ROOT / "leaderboard" / "records" / name) == of_metrics
+
+
+@pytest.mark.slow
+def test_the_correlations_of_shift_and_forgetting_are_those_of_the_committed_records() -> None:
+    stated = " ".join((ROOT / "docs" / "guide" / "statistics.md").read_text(encoding="utf-8").split())
+    free = ["aegis", "consft", "consft_calibrated", "finch", "l2_sp", "lora", "sft", "stop_gradient"]
+    maze = correlation_within_methods("PointMaze-v1", [*free, "experience_replay", "fast_dvla"])
+    readers = ["a_gem", "buffered_replay", "ewc", "experience_replay", "fast_dvla"]
+    every, without = (correlation_within_methods("Fetch-v1", names) for names in ([*free, *readers], free))
+    assert f"is {maze:.2f} on PointMaze-v1, and on Fetch-v1 it is {every:.2f} for all methods" in stated
+    assert f"for all methods and {without:.2f} for those without prior demonstrations." in stated
+
+
+def correlation_within_methods(scenario: str, methods: list[str]) -> float:
+    """Return the correlation of what is left of both metrics without the means of methods and of seeds."""
+    values = []
+    for method in methods:
+        files = sorted((ROOT / "leaderboard" / "records" / scenario / method).glob("seed-*.json"))
+        runs = [Scores.from_record(read_record(file)) for file in files]
+        values.append([[measure(name, one) for name in ("shift", "kept_share")] for one in runs])
+    noise = np.array(values, dtype=float) * (1, -1)
+    noise -= noise.mean(axis=1, keepdims=True)
+    noise -= noise.mean(axis=0, keepdims=True)
+    return float(np.corrcoef(noise[..., 0].ravel(), noise[..., 1].ravel())[0, 1])
 
 
 def test_the_examples_of_the_page_give_its_results() -> None:

@@ -1,5 +1,7 @@
 """Agreement on the order of the rows, against SciPy's Kendall's tau and a count of random orders."""
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy.stats import kendalltau
@@ -59,6 +61,17 @@ def test_the_chance_is_that_of_a_random_order_of_the_rows() -> None:
     assert farther.chance == pytest.approx(2 * 98 / 720)
     assert farther.low > 0
     assert farther.direction == 0
+
+
+def test_with_rows_that_tie_the_chance_is_that_of_a_random_order_too() -> None:
+    tied, other = np.array([0.0, 1.0, 1.0, 2.0, 3.0, 4.0]), np.array([1.0, 0.0, 2.0, 3.0, 5.0, 4.0])
+    taus = [kendalltau(tied[list(order)], other).statistic for order in itertools.permutations(range(6))]
+    as_far = np.abs(taus) >= abs(taus[0]) - 1e-9
+    seeds = np.zeros((6, 4))
+    found = agreement_between(tied[:, None] + seeds, other[:, None] + seeds)
+    assert found.chance == pytest.approx(as_far.mean())
+    assert found.chance == agreement_between(other[:, None] + seeds, tied[:, None] + seeds).chance
+    assert abs(found.chance - kendalltau(tied, other).pvalue) > 0.01  # SciPy's normal approximation
 
 
 def test_one_seed_of_a_board_shows_no_agreement() -> None:
