@@ -103,7 +103,7 @@ def show(
         _print_not_shown(shown, messages)
         return
     with checked_input():
-        written = [] if computed is None else write_site(computed, records, inputs)
+        written = {} if computed is None else write_site(computed, records, inputs)
     console = Console()
     console.print(terminal(shown, console.width, sort))
     if written:

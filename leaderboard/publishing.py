@@ -40,7 +40,7 @@ NUMBERS = "board.json"
 _CODE = (
     *("clbench.base", "clbench.spec", "clbench.records", "clbench.runs", "clbench.scoring"),
     *("clbench.learning", "clbench.metrics", "clbench.leaderboard.board", "clbench.leaderboard.policies"),
-    "clbench.leaderboard.views",
+    *("clbench.leaderboard.views", "clbench.leaderboard.publishing"),
 )
 """Code that the board and its pages depend on, besides the packages of the installed methods."""
 
@@ -108,8 +108,9 @@ def read_unchanged(records: Path, inputs: dict[str, str]) -> Summary | None:
     """Return the numbers of the board, None unless every file of the site is whole and made from `inputs`."""
     site = site_of(records)
     try:
-        kept: dict[str, Any] = json.loads(read_regular(site / NUMBERS))
-        files = {name: _hash_of_bytes(read_regular(site / name)) for name in kept["files"]}
+        # without the limit of `read_regular`, which is for records of others: the page may be larger
+        kept: dict[str, Any] = json.loads((site / NUMBERS).read_bytes())
+        files = {name: _hash_of_bytes((site / name).read_bytes()) for name in kept["files"]}
         whole = kept["files"] == files and kept["content"] == content_hash(kept)
         return Summary.from_json(kept["board"]) if whole and kept["made_from"] == inputs else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):  # none yet, or damaged
@@ -127,8 +128,8 @@ def read_board(records: Path) -> Summary:
     return read_unchanged(records, inputs_of(records)) or compute_board(records)
 
 
-def write_site(board: Board, records: Path, inputs: dict[str, str]) -> list[Path]:
-    """Write every form of the board to the folder of the board, and return the paths."""
+def write_site(board: Board, records: Path, inputs: dict[str, str]) -> dict[Path, bool]:
+    """Write every form of the board to the folder of the board, and return which files changed."""
     # They load the charts, SciPy and PyTorch: 3 s.
     from .policies.compared import by_table
     from .views import page as web_page
@@ -156,7 +157,7 @@ def write_site(board: Board, records: Path, inputs: dict[str, str]) -> list[Path
 def _files_of(site: Path) -> set[str]:
     """Return the names of the files that the board of a folder was written to; none if that is unknown."""
     try:
-        names = json.loads(read_regular(site / NUMBERS))["files"]
+        names = json.loads((site / NUMBERS).read_bytes())["files"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return set()
     return {name for name in names if isinstance(name, str) and Path(name).name == name}

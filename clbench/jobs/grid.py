@@ -63,7 +63,7 @@ class Missing(NamedTuple):
         for one in self.runs:
             plan.add_run(one, records, limits, checkpoints=checkpoints, tensorboard=tensorboard)
         for one in self.stages:
-            plan.add_stages(one, checkpoints)
+            plan.add_stages(one, checkpoints, limits)
         return plan
 
 

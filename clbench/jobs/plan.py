@@ -15,7 +15,7 @@ from clbench.policy.kinds import policy_class
 from clbench.records.paths import table_name
 from clbench.runs.length import point_length, run_length, training_length, watching_length
 from clbench.runs.spec import ResolvedRun
-from clbench.runs.start import is_evaluated
+from clbench.runs.start import is_evaluated, starts_as_pretrained
 from clbench.spec.identifiers import folder_name, without_module
 from clbench.spec.limits import Limits
 from clbench.spec.policies import DEFAULT_POLICY, kind_of
@@ -94,7 +94,7 @@ class Plan:
             "checkpoints": checkpoints and checkpoints.absolute(),
             "tensorboard": tensorboard and tensorboard.absolute(),
         }
-        start = self._start(run)
+        start = self._start(run) if starts_as_pretrained(run) else None
         return self._add(
             run,
             _label(run),
@@ -106,18 +106,20 @@ class Plan:
             _record_of(run, records),
         )
 
-    def add_stages(self, run: ResolvedRun, checkpoints: Path | None) -> Job:
+    def add_stages(self, run: ResolvedRun, checkpoints: Path | None, limits: Limits | None = None) -> Job:
         """Add a job that makes the policies of all stages of a run, without a record, and return it.
 
         Args:
             run: The run.
             checkpoints: Folder below which the policies are kept; None leaves them in the cache alone.
+            limits: Limits of the process of the job; None sets none.
         """
         arguments = {"spec": run.spec, "checkpoints": checkpoints and checkpoints.absolute()}
         title = f"stages of {_label(run)}"
         length = training_length(run.scenario) + watching_length(run.method, run.scenario)
         product = None if checkpoints is None else _policies_of(run, checkpoints.absolute())
-        return self._add(run, title, work.make_policies, arguments, length, self._needs(run), product=product)
+        needs = self._needs(run)
+        return self._add(run, title, work.make_policies, arguments, length, needs, limits, product)
 
     def add_demonstrations(self, name: str, scenario: Scenario, tasks: Iterable[Task]) -> tuple[Job, ...]:
         """Add jobs that collect the demonstrations of tasks, and return them.

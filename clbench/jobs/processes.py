@@ -231,12 +231,12 @@ def _end(process: BaseProcess) -> None:
 
 @contextmanager
 def _signals_held_back() -> Iterator[None]:
-    """Hold back Ctrl-C and SIGTERM inside: an interrupted start would leave half a process behind."""
+    """Hold back the signals that end the command: an interrupted start would leave half a process behind."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     held: list[int] = []
-    stops = (signal.SIGINT, signal.SIGTERM)
+    stops = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     before = {stop: signal.signal(stop, lambda number, _: held.append(number)) for stop in stops}
     try:
         yield

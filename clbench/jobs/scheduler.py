@@ -39,7 +39,8 @@ def run_jobs(jobs: Sequence[Job], workers: Workers, bars: Bars) -> dict[Job, str
         while waiting or started:
             interrupts.check()
             waiting = _drop_hopeless(waiting, failed)
-            for job, fault in leases.take(_ready(waiting, succeeded), workers.free()).items():
+            taken = leases.take(_ready(waiting, succeeded), workers.free())
+            for job, fault in taken.items():
                 waiting.remove(job)
                 ending = fault or _ending(job)
                 if ending is not None:
@@ -53,7 +54,7 @@ def run_jobs(jobs: Sequence[Job], workers: Workers, bars: Bars) -> dict[Job, str
                 workers.start(job)
                 started[job] = time.monotonic()
                 bars.start(job, job.duration)
-            if not started and waiting:
+            if not started and not taken and waiting:
                 leases.wait(waiting, workers.free() > 0, bars)
             for job, kind, value in workers.events() if started else ():
                 if kind == "progress":

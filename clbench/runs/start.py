@@ -7,6 +7,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from clbench.base.cache import cache_folder, cached, hash_of, hash_of_tensors, is_cached
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.data.training_data import TrainingData
@@ -82,9 +84,23 @@ def evaluate_pretrained(run: ResolvedRun, progress: ProgressCallback = no_progre
 
 
 def is_evaluated(run: ResolvedRun) -> bool:
-    """Return whether the cache has the evaluation of the pretrained policy; the policy must exist."""
+    """Return whether the cache has the evaluation of the pretrained policy; the policy must exist.
+
+    On a machine without the GPU of the run it is not known, and False: a worker may have one.
+    """
+    if torch.device(run.spec.device).type == "cuda" and not torch.cuda.is_available():
+        return False
     policy, _ = pretrained_policy(run.scenario, run.spec.seed)
     return is_cached(*_kept(_of_baseline(run), policy))
+
+
+def starts_as_pretrained(run: ResolvedRun) -> bool:
+    """Return whether `evaluate_start` may take the evaluation that `evaluate_pretrained` leaves.
+
+    Built-in methods change what a policy computes by its weights alone. `prepare` of another one may add a
+    hook or replace `act`, which no weight shows.
+    """
+    return run.method.prepare is Method.prepare or run.spec.method in built_in_methods()
 
 
 def _of_baseline(run: ResolvedRun) -> ResolvedRun:
@@ -95,11 +111,9 @@ def _of_baseline(run: ResolvedRun) -> ResolvedRun:
 def _kept(run: ResolvedRun, policy: Policy) -> tuple[Path, dict[str, Any]]:
     """Return the folder of an evaluation in the cache, and everything that it depends on."""
     spec = run.spec
-    # built-in methods change what a policy computes by its weights alone; `prepare` of another one may add a
-    # hook or replace `act`, which no weight shows
-    own = run.method.prepare is not Method.prepare and spec.method not in built_in_methods()
+    own = {"method": describe_method(run.method), "settings": run.info.settings}
     inputs = {
-        **({"method": describe_method(run.method), "settings": run.info.settings} if own else {}),
+        **({} if starts_as_pretrained(run) else own),
         "policy": hash_of_tensors(policy.state_dict()),
         "scenario": dataclasses.asdict(run.scenario_info),
         "spec": [spec.seed, spec.device, spec.split, spec.perturb],

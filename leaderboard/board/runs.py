@@ -171,8 +171,7 @@ def _check_settings(run: RunInfo) -> None:
         raise RecordError(f"run: changes and settings differ in {', '.join(lost)}.")
     if method not in built_in_methods():
         return
-    table = table_name(run.scenario, run.policy)
-    uses, defaults = _declared(table, method, run.split != "validation")
+    uses, defaults = _declared(table_name(run.scenario, run.policy), method, run.split != "validation")
     if run.uses != uses:
         raise RecordError(f"run: uses do not match {method}: {', '.join(differences(run.uses, uses))}.")
     # a setting that is missing here was added later, with a default that changes nothing
@@ -361,7 +360,8 @@ def same_settings(runs: list[Run]) -> Sifted:
     def parts(run: Run) -> list[dict[str, Any]]:
         info = run.record.run
         # a setting that an older record lacks was added later, with a default that changes nothing
-        defaults = _declared(run.table, info.method)[1] if info.method in built_in_methods() else {}
+        is_built_in = info.method in built_in_methods()
+        defaults = _declared(run.table, info.method, tuned=False)[1] if is_built_in else {}
         return [{**defaults, **info.settings}, info.uses, {"device": info.device, **_learner(run)}]
 
     def reason(run: Run, other: Run) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -13,15 +13,18 @@ from clbench.base.leftovers import replacing
 from clbench.base.text import print_plain
 
 
-def write_all(texts: Mapping[Path, str]) -> list[Path]:
-    """Write the texts to their paths, all or none, and return the paths.
+def write_all(texts: Mapping[Path, str]) -> dict[Path, bool]:
+    """Write the texts to their paths, all or none.
 
-    A file that has its text already is left alone. Nothing is replaced before everything is written beside
-    its place: a full disk leaves the old files.
+    Nothing is replaced before everything is written beside its place: a full disk leaves the old files.
+
+    Returns:
+        Whether each file was written: one that has its text already is left alone.
 
     Raises:
         InputError: The file system refuses one of them.
     """
+    written = dict.fromkeys(texts, False)
     path = Path()
     try:
         with ExitStack() as stack:
@@ -31,13 +34,14 @@ def write_all(texts: Mapping[Path, str]) -> list[Path]:
                     continue
                 path.parent.mkdir(parents=True, exist_ok=True)
                 stack.enter_context(replacing(path)).write_bytes(content)
+                written[path] = True
     except OSError as error:
         raise InputError(f"{error.filename2 or path} cannot be written: {error.strerror}.") from error
-    return list(texts)
+    return written
 
 
-def print_written(paths: Iterable[Path]) -> None:
-    """Print the paths of files that were written."""
+def print_written(written: Mapping[Path, bool]) -> None:
+    """Print what `write_all` returned."""
     console = Console()
-    for path in paths:
-        print_plain(console, f"Written: {path}")
+    for path, is_new in written.items():
+        print_plain(console, f"{'Written' if is_new else 'Unchanged'}: {path}")

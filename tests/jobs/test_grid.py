@@ -25,6 +25,7 @@ from clbench.jobs.scheduler import run_with_bars
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.runs.stages import has_stages, keep_stages
+from clbench.spec.limits import Limits
 
 TOY = "clbench.testing:clbench/Toy-v0"
 TINY = "tiny:me/Tiny-v0"
@@ -190,6 +191,16 @@ def test_policies_that_another_command_has_made_again_meanwhile_are_not_made_twi
     assert run_with_bars(jobs, Here(), Console(file=printed, width=200)) == {}
     assert "me--Tiny-v0 stages of frozen seed 0: done by another command" in printed.getvalue()
     assert {path: path.stat().st_ino for path in kept.rglob("*")} == before
+
+
+@pytest.mark.long
+def test_making_policies_of_a_submitted_method_again_has_the_limits_of_its_check(tmp_path: Path) -> None:
+    run, records, kept = RunSpec(TINY, "frozen", 0).resolve(), tmp_path / "records", tmp_path / "kept"
+    execute(run, records)
+    limits = Limits(seconds=60.0)
+    check = Job("check", str, {}, 1.0, limits=limits)
+    *_, stages = missing([run], records, kept).plan(records, kept, check=check).jobs
+    assert (stages.title, stages.limits) == ("me--Tiny-v0 stages of frozen seed 0", limits)
 
 
 @pytest.mark.parametrize(

@@ -6,13 +6,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from eager import EAGER
 from tiny import TINY
 
 from clbench.base.errors import UnknownNameError
 from clbench.jobs.job import Job
 from clbench.jobs.plan import Plan
+from clbench.learning.method import Method
 from clbench.learning.pretraining import pretrained_policy
+from clbench.learning.prior import Prior
+from clbench.policy.policy import Policy
 from clbench.policy.transformer import TransformerPolicy
 from clbench.records.reader import read_record
 from clbench.records.writer import write_record
@@ -180,6 +184,29 @@ def test_runs_share_the_evaluation_of_a_start_only_if_it_is_the_same(
     assert starts({"perturb": True}, {"perturb": True}) == 1
     for other in ({"perturb": True}, {"split": "validation"}, {"order": 1}, {"targets": 1}):
         assert starts({}, other) == 2
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+def test_a_run_for_a_gpu_of_a_cluster_is_planned_on_a_machine_without_one(tmp_path: Path) -> None:
+    (start, run) = _plan(tmp_path, RunSpec("clbench/Fetch-v1", "sft", 0, device="cuda"))[-2:]
+    assert start.title == "Fetch-v1 evaluation of the pretrained policy seed 0"
+    assert (run.title, run.device) == ("Fetch-v1 sft seed 0", "cuda")
+
+
+@dataclasses.dataclass
+class Prepared(Method):
+    """A method that prepares, perhaps with a hook that no weight shows."""
+
+    def prepare(self, policy: Policy, prior: Prior) -> None:
+        pass
+
+
+def test_a_method_of_a_stranger_that_prepares_waits_for_no_evaluation_that_it_does_not_use(
+    tmp_path: Path, empty_caches: Path, stranger: Callable[[type[Method]], str]
+) -> None:
+    for method, evaluations in (("lora", 1), ("sft", 1), (stranger(Prepared), 0)):
+        jobs = _plan(tmp_path, RunSpec(TINY.id, method, 0))
+        assert sum("evaluation" in job.title for job in jobs) == evaluations
 
 
 def test_runs_of_two_scenarios_have_separate_jobs_and_one_pretraining_for_each_seed(

@@ -224,22 +224,23 @@ def test_stopping_the_scheduler_ends_its_processes(
         os.kill(int(path.read_text()), 0)
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_a_ctrl_c_while_a_job_starts_is_not_lost(
-    tmp_path: Path, bars: Bars, monkeypatch: pytest.MonkeyPatch
+    number: signal.Signals, tmp_path: Path, bars: Bars, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ensure_running, path = forkserver.ensure_running, tmp_path / "pid"
 
     def interrupted() -> None:
-        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(number)
         ensure_running()
 
     monkeypatch.setattr(forkserver, "ensure_running", interrupted)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # tests may run where it is ignored
+    before = signal.signal(number, signal.default_int_handler)  # tests may run where it is ignored
     try:
         with pytest.raises(KeyboardInterrupt):
             run_jobs([_job("slow", "slow", path=str(path))], Processes(1), bars)
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(number, before)
     if path.exists() and path.read_text():
         with pytest.raises(ProcessLookupError):
             os.kill(int(path.read_text()), 0)
@@ -284,6 +285,14 @@ class _Two:
 
     def close(self) -> None:
         pass
+
+
+def test_jobs_that_are_done_already_are_not_waited_for(tmp_path: Path, bars: Bars) -> None:
+    jobs = [_claimed(name, tmp_path / name) for name in ("one", "two", "three")]
+    for job in jobs:
+        (tmp_path / job.title).touch()
+    assert run_jobs(jobs, _Two(), bars) == {}
+    assert [line.partition(":")[2] for line in printed(bars).splitlines()] == [" done by another command"] * 3
 
 
 def test_without_a_free_worker_the_scheduler_waits_for_one_and_says_so_once(

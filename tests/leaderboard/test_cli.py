@@ -75,10 +75,13 @@ def test_the_files_do_not_depend_on_where_the_records_lie(
 def test_unchanged_records_show_the_same_board_without_being_read(
     four_methods: Path, shown: Callable[[], tuple[str, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    most = max(path.stat().st_size for path in four_methods.rglob("*.json"))
+    monkeypatch.setattr("clbench.base.strict_json.MOST_BYTES", most)  # the limit of a record
     (four_methods / "torn.json").write_text("{", encoding="utf-8")
     frame, plane = load(four_methods), clbench.plot.plane(four_methods).spec
     table, _, written = shown()[0].partition("Written: ")
     assert "board.json" in written
+    assert (four_methods.parent / "site" / "board.json").stat().st_size > most
 
     def fail(_: Path) -> None:
         raise AssertionError("the records were read")

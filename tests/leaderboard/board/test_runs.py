@@ -36,3 +36,18 @@ def test_seeds_of_code_that_changed_between_them_make_no_row_together(
     assert len(kept) == 2
     (entry,) = refused
     assert entry.reason == f"its settings do not match most seeds: code of the {part} differ."
+
+
+def test_a_record_that_lacks_a_setting_had_its_default_and_not_what_tuning_chose_later(
+    make_record: Callable[..., Record], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("clbench.leaderboard.board.runs.tuned_settings", lambda *_: {"step_factor": 0.3})
+    for seed, settings in enumerate(({}, {"step_factor": 0.3}, {"step_factor": 0.3})):
+        record = make_record([[1.0, 0.0], [0.5, 1.0]], groups=(1, 1, 0), episodes=2, seed=seed, method="sft")
+        run = dataclasses.replace(record.run, settings=settings, policy="tuned:Later")  # a table of its own
+        path = record_path(tmp_path, SCENARIO, run.method, seed, policy=run.policy)
+        write_record(dataclasses.replace(record, run=run), path)
+    kept, refused = read_runs(tmp_path, read_run, ALIKE)
+    assert [run.seed for run in kept] == [1, 2]
+    (entry,) = refused
+    assert entry.reason == "its settings do not match most seeds: step_factor differ."
