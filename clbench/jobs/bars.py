@@ -20,7 +20,7 @@ LINE_SECONDS = 30.0
 """Seconds between two lines without a terminal."""
 
 KNOWN = 0.01
-"""Share of all work from which the time left is told: after 30 s of a work of hours it told two weeks."""
+"""Share of all work from which the time left is shown: 30 s into hours of work, it showed two weeks."""
 
 AT_ONCE = 1.0
 """A piece that ends within so many seconds was done before: its result is cached, for example."""

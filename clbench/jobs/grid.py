@@ -156,7 +156,7 @@ def _part(lost: int, count: int) -> str:
 
 
 def _without_record(jobs: Sequence[Job], failed: Mapping[Job, str], records: Path) -> dict[Job, str]:
-    """Return the reason of each run that went well by its own words and has no record that counts."""
+    """Return the reason of each run that reported success and has no record that counts."""
     lost = {}
     for job in jobs:
         if job.product is None or job in failed or job.product.exists():

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
 from clbench.base.errors import ClbenchError
-from clbench.base.lease import Lease
 from clbench.spec.limits import Limits
 
 
@@ -26,7 +25,7 @@ class Product:
     """Place of the file or folder."""
     exists: Callable[[], bool]
     """Returns whether a command has made it."""
-    has_failed: Callable[[], bool] = bool
+    has_failed: Callable[[], bool] = lambda: False
     """Returns whether another command tried to make it since this one began, and failed."""
 
 
@@ -62,16 +61,12 @@ class Job:
         return self.length * self.pace
 
     def bare(self) -> Job:
-        """Return the job with what a worker needs alone.
+        """Return the job with only what a worker needs.
 
         The command has the lease, and looks for the product. The functions that look know the whole run: they
         would travel with it, and make the worker import its method before it begins.
         """
         return replace(self, needs=(), product=None)
-
-    def new_lease(self) -> Lease | None:
-        """Return the lease that a command needs to do the job, None if it needs none."""
-        return None if self.product is None else Lease(self.product.path)
 
 
 def chain_times(
@@ -97,7 +92,7 @@ def chain_times(
 
 
 Outcome = Literal["done", "failed", "taken"]
-"""How a job ended by its own words; a job is taken if another process took its work over."""
+"""How a job ended, as it reported; a job is taken if another process took its work over."""
 
 
 class Event(NamedTuple):

@@ -47,9 +47,8 @@ class Plan:
 
     def __init__(self, first: Job | None = None) -> None:
         self._first = () if first is None else (first,)
-        self._target_data: dict[tuple[str, str], Job] = {}
         self._questions: dict[str, Job] = {}
-        self._retained_data: dict[tuple[str, str], Job] = {}
+        self._data: dict[tuple[str, str], Job] = {}
         self._policies: dict[tuple[str, str, int], Job | None] = {}
         self._starts: dict[tuple[object, ...], Job | None] = {}
         self._runs: list[Job] = []
@@ -57,7 +56,7 @@ class Plan:
     @property
     def inputs(self) -> list[Job]:
         """The jobs that need no method: data, and pretrained policies."""
-        kinds = (self._target_data, self._questions, self._retained_data, self._policies)
+        kinds = (self._questions, self._data, self._policies)
         return [job for kind in kinds for job in kind.values() if job is not None]
 
     @property
@@ -216,17 +215,15 @@ class Plan:
 
     def _demonstrations(self, name: str, scenario: Scenario, task: Task) -> Job:
         """Return the job that collects the demonstrations of a task."""
-        is_target = any(task.name == target.name for target in scenario.target)
-        jobs = self._target_data if is_target else self._retained_data
         key = name, task.name
-        if key not in jobs:
+        if key not in self._data:
             title, arguments = (
                 _title(name, f"demonstrations {task.name}"),
                 {"scenario": name, "task": task.name},
             )
             length = scenario.budget.demonstrations
-            jobs[key] = Job(title, work.collect_demonstrations, arguments, length, self._first)
-        return jobs[key]
+            self._data[key] = Job(title, work.collect_demonstrations, arguments, length, self._first)
+        return self._data[key]
 
 
 def _check_entry_points(scenario: Scenario) -> None:

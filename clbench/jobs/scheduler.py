@@ -10,6 +10,7 @@ from rich.console import Console
 
 from clbench.base import interrupts
 from clbench.base.errors import ClbenchError
+from clbench.base.lease import Lease
 from clbench.jobs.bars import Bars
 from clbench.jobs.job import Job, Workers, chain_times
 
@@ -98,7 +99,7 @@ class _Leases:
     """The leases of jobs that one command at a time may do."""
 
     def __init__(self, jobs: Sequence[Job]) -> None:
-        self._all = {job: lease for job in jobs if (lease := job.new_lease()) is not None}
+        self._all = {job: Lease(job.product.path) for job in jobs if job.product is not None}
         self._tried: dict[Job, float] = {}
         self._told = set[bool]()
 
@@ -106,7 +107,7 @@ class _Leases:
         """Take the leases of as many of the jobs as can be had, in their order, and return these jobs.
 
         A lease that another command had within `WAIT_SECONDS` is not tried: a file server answers each try.
-        Each comes with the fault of the file system that refused a lease, None where there is none.
+        Each job comes with the fault of the file system that refused its lease, or None.
         """
         taken: dict[Job, str | None] = {}
         for job in ready:

@@ -193,7 +193,7 @@ def tied_gains(
     """Return the gains of methods over plain fine-tuning at each tied setting, from runs of the ladder.
 
     Args:
-        scenario: Gymnasium id of the scenario.
+        scenario: Name of the table: the scenario, and the policy if it is another one.
         methods: Scores by method and seed.
         ladder: Runs of the ladder, of any scenario and method.
     """

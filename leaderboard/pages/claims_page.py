@@ -16,7 +16,7 @@ from ..claims.claim import tally
 from ..claims.evidence import LEAST_SEEDS, Figure
 from ..claims.judges import Judged
 from ..views.format import MISSING, format_interval
-from ..views.markdown import template
+from ..views.templating import template
 
 CHECKS = {"replayed": "replayed {}", "retrained": "repeated {} as a whole"}
 """What another process did with the records of a tier."""

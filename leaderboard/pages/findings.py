@@ -23,8 +23,8 @@ from ..claims.evidence import Evidence
 from ..claims.judges import Judged
 from ..policies.compared import by_table
 from ..views.format import MISSING, format_interval, tau_text
-from ..views.markdown import template
 from ..views.page.charts.picture import in_both_themes
+from ..views.templating import template
 from .agreements import after_correction, agreement_sentences, without_demonstrations
 from .findings_chart import gains_chart
 from .gains import Tied, by_gain, gain_sentences, gain_table

@@ -26,7 +26,7 @@ from ..claims.evidence import SHARE, Evidence
 from ..claims.judges import Judged
 from ..views.descriptions import Description, common_hyper_parameters
 from ..views.format import shown
-from ..views.markdown import arxiv_ids, template
+from ..views.templating import arxiv_ids, template
 
 COMPARISONS = ("sft", "experience_replay", "frozen")
 """Methods whose rows are next to the method's own."""

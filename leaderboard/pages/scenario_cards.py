@@ -39,7 +39,7 @@ from ..board.rows import Board, Row
 from ..board.runs import differences
 from ..board.summary import RANKED_BY, competing, divisions_of, grouped
 from ..views.format import MISSING
-from ..views.markdown import template
+from ..views.templating import template
 from .scenario_spaces import spaces_of
 from .scenario_tasks import Experts, picture_path
 

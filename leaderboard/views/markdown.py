@@ -1,22 +1,12 @@
-"""The leaderboard as Markdown, and the environment of all templates of Markdown pages.
-
-The same content gives the same bytes. A template escapes every value unless it is of the type `Markdown`.
-"""
+"""The leaderboard as Markdown. The same content gives the same bytes."""
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable, Mapping, Sequence
-from functools import cache
-from pathlib import Path
-from typing import Any
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
-
-from clbench.base.text import counted, printable
+from clbench.base.text import counted
 from clbench.records.paths import table_parts
-from clbench.scoring.intervals import Estimate
 from clbench.scoring.metric import Metric
 
 from ..board.frontier import TiedGain
@@ -26,27 +16,18 @@ from ..board.summary import letters_of, tables_of
 from ..policies.compared import Comparisons
 from ..policies.decoders import read_decoding
 from .format import (
-    MISSING,
     Column,
     agreement_text,
     column_title,
-    format_interval,
     machine_text,
-    number_text,
     over_tied,
     prediction_text,
     shown,
     start_text,
     tiers_text,
-    title_of,
     unpaired_text,
 )
-
-_ARXIV = re.compile(r"arXiv (\d{4}\.\d{5})")
-
-
-class Markdown(str):
-    """Text that is Markdown already: templates do not escape it."""
+from .templating import template
 
 
 def markdown(board: Board, comparisons: Comparisons) -> str:
@@ -100,89 +81,3 @@ def _all_shown(tables: Iterable[Sequence[Row]]) -> list[Column]:
 
 def _ends(metric: Metric) -> list[str]:
     return ["unbounded" if math.isinf(end) else f"{end:g}" for end in (metric.low, metric.high)]
-
-
-# ---- templates ---------------------------------------------------------------------------------------------
-
-
-def template(module: str, name: str) -> Template:
-    """Return a template in the folder `templates` beside a module, which gives its `__file__`."""
-    return _templates(Path(module).with_name("templates")).get_template(name)
-
-
-@cache
-def _templates(folder: Path) -> Environment:
-    """Return the templates in `folder`, with the filters that Markdown pages need."""
-    environment = Environment(
-        loader=FileSystemLoader(folder),
-        autoescape=False,  # it would escape HTML; `finalize` escapes Markdown
-        finalize=_escaped_unless_markdown,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters.update(
-        code=code,
-        interval=_interval,
-        lines=_lines,
-        links=links,
-        number=number_text,
-        prose=prose,
-        raw=Markdown,
-        title_of=title_of,
-    )
-    environment.globals.update(MISSING=MISSING)
-    return environment
-
-
-def _escaped_unless_markdown(value: object) -> str:
-    return value if isinstance(value, Markdown) else escaped(str(value))
-
-
-def escaped(text: str) -> Markdown:
-    """Return `text`, which a stranger may have written, so that Markdown shows it as it is.
-
-    Backslashes go before every character that can open markup, HTML, a formula, a mention or a table cell,
-    and into web addresses.
-    """
-    return Markdown(
-        re.sub(
-            r"([\\`*_{}\[\]<>|~&@#$]|(?<=:)/(?=/)|(?<=www)\.)", r"\\\1", printable(text), flags=re.IGNORECASE
-        )
-    )
-
-
-def prose(text: str) -> Markdown:
-    """Return words of ours for Markdown: code in backticks stays, arXiv identifiers become links."""
-    parts = re.split(r"(`[^`]+`)", text)
-    return Markdown("".join(part if part.startswith("`") else linked(escaped(part)) for part in parts))
-
-
-def linked(text: str) -> Markdown:
-    """Return `text` with links for the arXiv identifiers in it."""
-    return Markdown(_ARXIV.sub(r"[arXiv \1](https://arxiv.org/abs/\1)", text))
-
-
-def arxiv_ids(text: str) -> list[str]:
-    """Return the arXiv identifiers in `text`, each once, in order."""
-    return list(dict.fromkeys(_ARXIV.findall(text)))
-
-
-def links(ids: Iterable[str]) -> Markdown:
-    """Return links to papers, given their arXiv identifiers."""
-    return Markdown(", ".join(linked(f"arXiv {one}") for one in ids))
-
-
-def code(text: str) -> Markdown:
-    """Return `text`, of ours, as code."""
-    return Markdown(f"`{text}`")
-
-
-def _interval(estimate: Estimate, form: str = ".2f") -> Markdown:
-    return Markdown(format_interval(estimate, form))
-
-
-def _lines(texts: Iterable[Any]) -> Markdown:
-    """Return texts below each other in one cell."""
-    return Markdown("<br>".join(map(escaped, texts)))

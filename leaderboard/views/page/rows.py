@@ -33,7 +33,7 @@ from ..format import (
     tier_text,
     title_of,
 )
-from ..markdown import arxiv_ids
+from ..templating import arxiv_ids
 from .charts.vega import finite, rounded
 from .curves import estimated, retained_curve, target_curves
 from .details import Diagnostics, Entry, commands, diagnostics, flat, same_or_each
