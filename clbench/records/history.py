@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from clbench.base.errors import InputError
-from clbench.records.record import CHECK_COLUMNS
+from clbench.records.record import CheckRow
 
 SPLITS = {"report": "test", "selection": "validation"}
 """Splits of schemas 1 and 2, with their present names."""
@@ -135,7 +135,7 @@ def _from_2(values: _Values) -> _Values:
         policy["shift"] = [None] * len(policy["stage"])
     _refuse_later("a record", values, ("checks", "relearning"), 2)
     changed = {"run": run, "scenario": scenario, "episodes": episodes, "policy": policy, "costs": costs}
-    checks: _Values = {name: [] for name in CHECK_COLUMNS}
+    checks: _Values = {name: [] for name in CheckRow._fields}
     return {**_with(values, changed), "checks": checks, "relearning": None}
 
 

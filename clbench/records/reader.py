@@ -15,12 +15,12 @@ from clbench.records.fields import load_fields
 from clbench.records.history import to_present
 from clbench.records.paths import label_of, record_name
 from clbench.records.record import (
-    ANSWER_COLUMNS,
-    CHECK_COLUMNS,
     EPISODE_COLUMNS,
-    POLICY_COLUMNS,
     SCHEMA,
+    AnswerRow,
+    CheckRow,
     Costs,
+    PolicyRow,
     Record,
     RunInfo,
 )
@@ -125,9 +125,9 @@ def _record(values: Any) -> Record:
     if schema >= FIRST_DEFINED and record.status == "success":
         _check_definition(record, schema)
     _check_columns("episodes", record.episodes, EPISODE_COLUMNS)
-    _check_columns("answers", record.answers, ANSWER_COLUMNS)
-    _check_columns("policy", record.policy, POLICY_COLUMNS)
-    _check_columns("checks", record.checks, CHECK_COLUMNS)
+    _check_columns("answers", record.answers, AnswerRow._fields)
+    _check_columns("policy", record.policy, PolicyRow._fields)
+    _check_columns("checks", record.checks, CheckRow._fields)
     scenario = record.scenario
     _check_names("task", (*scenario.retained, *scenario.target, *scenario.held_out))
     _check_names("kind of question", set(record.answers["kind"]))

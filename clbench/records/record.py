@@ -26,26 +26,8 @@ EPISODE_COLUMNS = ("stage", "step", "task", "split", "episode", "success", "retu
 initial state inside its task and split. `clbench.spec.protocol.Protocol.episodes` says which episodes each
 point has."""
 
-ANSWER_COLUMNS = ("stage", "step", "kind", "asked", "correct")
-"""One row for each evaluation point and kind of question; a policy that was trained elsewhere is asked 0."""
-
-POLICY_COLUMNS = ("stage", "step", "update_sparsity", "activation_drift", "shift", "captured")
-"""One row for each evaluation point: how far the policy has moved.
-
-`update_sparsity` is the share of its parameters whose relative change from pretraining is below 1e-3.
-`activation_drift` is the squared 2-Wasserstein distance between its and the pretrained policy's hidden states
-on the questions, averaged over layers. `shift` is the mean squared change of what `Policy.predict` returns (a
-flow policy: the velocity) on 256 samples of the stage's target since the beginning of the stage, in
-normalised actions. `captured` is the share of episodes in which the policy does the stage's target although
-it is told to do a retained skill. Only the ends of stages have the last two. Each may be None.
-"""
-
 FARTHEST = 1e18
 """An activation drift or shift above this comes from a policy that diverged, and is recorded as None."""
-
-CHECK_COLUMNS = ("stage", "step", "episodes", "successes")
-"""One row for each check of a stage's criterion. A check plays the target's validation episodes until its
-outcome is certain: `episodes` have ended by then."""
 
 
 class EpisodeRow(NamedTuple):
@@ -75,7 +57,10 @@ class EpisodeRow(NamedTuple):
 
 
 class AnswerRow(NamedTuple):
-    """A row of `Record.answers`: the answers to one kind of question at one point."""
+    """A row of `Record.answers`: the answers to one kind of question at one point.
+
+    A policy that was trained elsewhere is asked 0 questions.
+    """
 
     stage: int
     """Stage, 0 before the first target."""
@@ -90,24 +75,33 @@ class AnswerRow(NamedTuple):
 
 
 class PolicyRow(NamedTuple):
-    """A row of `Record.policy`: how far the policy has moved at one point."""
+    """A row of `Record.policy`: how far the policy has moved at one point.
+
+    Only the ends of stages have the last two. Each value may be None.
+    """
 
     stage: int
     """Stage, 0 before the first target."""
     step: int
     """Optimiser steps done in the stage."""
     update_sparsity: float | None
-    """Share of the parameters that hardly changed; see `POLICY_COLUMNS` for this and the others."""
+    """Share of the policy's parameters whose relative change from pretraining is below 1e-3."""
     activation_drift: float | None
-    """Squared distance of the hidden states from where pretraining left them."""
+    """Squared 2-Wasserstein distance between the hidden states of this policy and of the pretrained one on
+    the questions, averaged over layers."""
     shift: float | None
-    """Mean squared change of the predictions since the beginning of the stage."""
+    """Mean squared change of what `Policy.predict` returns (a flow policy: the velocity) on 256 samples of
+    the stage's target since the beginning of the stage, in normalised actions."""
     captured: float | None
-    """Share of episodes in which the policy does the target instead of the skill that it is told."""
+    """Share of episodes in which the policy does the stage's target although it is told to do a retained
+    skill."""
 
 
 class CheckRow(NamedTuple):
-    """A row of `Record.checks`: a check whether the target is learned."""
+    """A row of `Record.checks`: a check whether the target is learned.
+
+    A check plays the target's validation episodes until its outcome is certain.
+    """
 
     stage: int
     """Stage whose criterion was checked."""
@@ -256,12 +250,12 @@ class Record:
     """The scenario in full."""
     episodes: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in EPISODE_COLUMNS})
     """Evaluation episodes as columns of equal length, see `EPISODE_COLUMNS`."""
-    answers: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in ANSWER_COLUMNS})
-    """Answers to test questions (in a tuning run: to training questions), see `ANSWER_COLUMNS`."""
-    policy: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in POLICY_COLUMNS})
-    """Changes of the policy, see `POLICY_COLUMNS`."""
-    checks: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in CHECK_COLUMNS})
-    """Checks of the criterion, see `CHECK_COLUMNS`."""
+    answers: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in AnswerRow._fields})
+    """Answers to test questions (in a tuning run: to training questions) as columns, see `AnswerRow`."""
+    policy: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in PolicyRow._fields})
+    """Changes of the policy as columns, see `PolicyRow`."""
+    checks: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in CheckRow._fields})
+    """Checks of the criterion as columns, see `CheckRow`."""
     relearning: Relearning | None = None
     """Relearning of the skill that succeeds least. None if it was not measured: without a criterion or a
     retained skill, in a tuning run, or where plain fine-tuning failed."""
@@ -307,6 +301,18 @@ class Record:
         """Return the rows of `episodes`."""
         return [EpisodeRow(*values) for values in zip(*self.episodes.values(), strict=True)]
 
+    def answer_rows(self) -> list[AnswerRow]:
+        """Return the rows of `answers`."""
+        return [AnswerRow(*values) for values in zip(*self.answers.values(), strict=True)]
+
+    def policy_rows(self) -> list[PolicyRow]:
+        """Return the rows of `policy`."""
+        return [PolicyRow(*values) for values in zip(*self.policy.values(), strict=True)]
+
+    def check_rows(self) -> list[CheckRow]:
+        """Return the rows of `checks`."""
+        return [CheckRow(*values) for values in zip(*self.checks.values(), strict=True)]
+
     @property
     def failure(self) -> str | None:
         """Where the run failed and of what, as "stage 1 (push): ValueError: no"; None if it did not."""
@@ -330,10 +336,6 @@ class Record:
     def add_answers(self, row: AnswerRow) -> None:
         """Append a row to `answers`."""
         _append(self.answers, row)
-
-    def check_rows(self) -> list[CheckRow]:
-        """Return the rows of `checks`."""
-        return [CheckRow(*values) for values in zip(*self.checks.values(), strict=True)]
 
     def add_check(self, row: CheckRow) -> None:
         """Append a row to `checks`."""

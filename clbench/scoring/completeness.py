@@ -37,16 +37,15 @@ def check_complete(record: Record, rows: Iterable[EpisodeRow], protocol: Protoco
     if not is_built_in(record.run.policy) and not sum(record.answers["asked"]):
         demanded = 0
     _check_answers(record, points, demanded)
-    moved = [Point(*place) for place in zip(record.policy["stage"], record.policy["step"], strict=True)]
+    moved = [Point(row.stage, row.step) for row in record.policy_rows()]
     _check_points("policy", moved, () if elsewhere else points)
 
 
 def _check_answers(record: Record, points: Sequence[Point], demanded: int) -> None:
     """Check that the same questions were asked at all points, and as many as the budget demands."""
     asked: dict[Point, dict[str, int]] = {}
-    stages, steps, kinds, counts, _ = record.answers.values()
-    for stage, step, kind, count in zip(stages, steps, kinds, counts, strict=True):
-        asked.setdefault(Point(stage, step), {})[kind] = count
+    for row in record.answer_rows():
+        asked.setdefault(Point(row.stage, row.step), {})[row.kind] = row.asked
     if not asked and not demanded:  # a scenario without questions
         return
     _check_points("answers", asked, points)

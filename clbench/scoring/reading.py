@@ -270,7 +270,7 @@ def read_answers(record: Record, protocol: Protocol) -> tuple[tuple[str, ...], A
     Raises:
         RecordError: A count is impossible, or a kind occurs twice at one point.
     """
-    rows, points = list(zip(*record.answers.values(), strict=True)), _Points(protocol)
+    rows, points = record.answer_rows(), _Points(protocol)
     for number, (stage, step, kind, asked, correct) in enumerate(rows):
         where = f"answers: row {number}"
         points.check(where, stage, step)
@@ -299,7 +299,7 @@ def read_policy(record: Record, protocol: Protocol) -> tuple[Array, Array, Array
     Raises:
         RecordError: A value is impossible, or a point occurs twice.
     """
-    rows, points = list(zip(*record.policy.values(), strict=True)), _Points(protocol)
+    rows, points = record.policy_rows(), _Points(protocol)
     found = np.full((len(_HIGHEST), len(protocol.stages), len(protocol.steps)), np.nan)
     for number, (stage, step, *values) in enumerate(rows):
         where = f"policy: row {number}"

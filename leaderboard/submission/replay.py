@@ -230,7 +230,7 @@ def _replay_answers(subject: Subject, policies: Sequence[Policy]) -> Check:
         for stage, policy in enumerate(policies)
         for counts in answer(policy, data.questions.kinds, kind, asked)
     ]
-    rows = zip(*subject.run.record.answers.values(), strict=True)
+    rows = subject.run.record.answer_rows()
     theirs = {row for row in rows if protocol.is_end(Point(*row[:2]))}
     wrong = [f"{row[2]} after stage {row[0]}" for row in sorted(theirs.symmetric_difference(again))]
     if wrong:
