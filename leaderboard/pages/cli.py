@@ -65,13 +65,14 @@ def findings(
         output: Path of the page; pictures go to the folder `findings` beside it.
     """
     from ..claims.judges import judge_all
-    from .findings import page, pictures, sections
+    from .findings import in_short, page, pictures, sections
 
     evidence = _evidence(None, records, controls)
     board = _board(records)
-    found = sections(board, judge_all(evidence), evidence)
+    judged = judge_all(evidence)
+    text = page(in_short(board, judged), sections(board, judged, evidence))
     drawn = {output.parent / "findings" / name: svg for name, svg in pictures(board).items()}
-    _write({output: page(found), **drawn})
+    _write({output: text, **drawn})
 
 
 def method_pages(

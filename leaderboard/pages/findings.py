@@ -17,7 +17,7 @@ from clbench.spec.references import BASELINE, FROZEN
 
 from ..board.predictors import predictions
 from ..board.rows import Board, Row, certain_sides
-from ..board.summary import WITHOUT_DEMONSTRATIONS, grouped, tables_of
+from ..board.summary import WITH_DEMONSTRATIONS, WITHOUT_DEMONSTRATIONS, grouped, tables_of
 from ..claims.claim import KNOWLEDGE, PREDICATES, Claim, Verdict, tally
 from ..claims.evidence import Evidence
 from ..claims.judges import Judged
@@ -51,9 +51,9 @@ class Section:
     """Stem of the name of the picture, empty without one."""
 
 
-def page(found: Sequence[Section]) -> str:
-    """Return the page as Markdown."""
-    return template(__file__, "findings.md.jinja").render(sections=found)
+def page(short: Sequence[str], found: Sequence[Section]) -> str:
+    """Return the page as Markdown: what `in_short` says, and the sections."""
+    return template(__file__, "findings.md.jinja").render(short=short, sections=found)
 
 
 def pictures(board: Board) -> dict[str, str]:
@@ -89,6 +89,44 @@ def sections(board: Board, judged: Sequence[Judged], evidence: Callable[[str], E
         _undecided(judged),
     )
     return [section for section in found if section.answers]
+
+
+def in_short(board: Board, judged: Sequence[Judged]) -> list[str]:
+    """Return the answers that most readers look for; `sections` have their figures and limits."""
+    above: dict[str, list[Row]] = {}
+    for name, rows in _boards(board).items():
+        sides = certain_sides(rows, board.tied.get(name, {}))
+        if others := by_gain(rows):
+            above[name] = [row for row in others if sides.get(row.method) == 1]
+    divisions = {"Without": WITHOUT_DEMONSTRATIONS, "With": WITH_DEMONSTRATIONS}
+    answers = []
+    for data, names in divisions.items() if above else ():
+        best = {name: [row for row in rows if row.division in names][:1] for name, rows in above.items()}
+        gains = grouped(
+            (row.method, f"{format_interval(row.estimates['gain'])} on {name}")
+            for name, rows in best.items()
+            for row in rows
+        )
+        parts = [f"`{method}` gains {listed(texts)}" for method, texts in gains.items()]
+        if none := [name for name, rows in best.items() if not rows]:
+            parts.append(f"no method is certainly better than tuned plain fine-tuning on {listed(none)}")
+        answers.append(f"{data} prior demonstrations: {'; '.join(parts)}.")
+    return answers + _claims_in_short(judged)
+
+
+def _claims_in_short(judged: Sequence[Judged]) -> list[str]:
+    """Return how many claims have which verdict on at least one board."""
+    verdicts = grouped((one.claim, one.finding.verdict) for one in judged if not one.claim.uncounted)
+    if not verdicts:
+        return []
+    decided: tuple[Verdict, ...] = ("holds", "holds in part", "does not hold")
+    numbers = {one: sum(one in found for found in verdicts.values()) for one in decided}
+    counts = listed([f"{number} {PREDICATES[one][number != 1]}" for one, number in numbers.items()])
+    others = sum(not set(decided) & set(found) for found in verdicts.values())
+    return [
+        f"Of the papers' {counted(len(verdicts), 'claim')}, {counts} on at least one board; {others} "
+        f"{'is' if others == 1 else 'are'} undecided, or cannot be shown, on every board."
+    ]
 
 
 def _boards(board: Board) -> dict[str, list[Row]]:

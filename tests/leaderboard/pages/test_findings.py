@@ -44,6 +44,8 @@ def test_a_method_that_is_certainly_better_is_named_with_its_gain(
     fill(even_board, sft=0.4, finch=0.8, lora=0.4, l2_sp=0.0)
     text = page()
     # kept counts two skills and one earlier target of four tasks in all: a gain of 3/4 of the difference
+    assert re.search(r"Without prior demonstrations: `finch` gains 0\.30 \[.*?\] on clbench/Even-v1\.", text)
+    assert "With prior demonstrations: no method is certainly better than tuned plain fine-tuning on" in text
     assert "On clbench/Even-v1, yes: `finch` by 0.300 [" in text
     assert "Told apart from plain fine-tuning as worse: `l2_sp` by 0.300 [" in text
     table = text.partition("| scenario | method | gain |")[2]
@@ -172,6 +174,19 @@ def test_claims_that_hold_are_named_since_some_are_about_plain_fine_tuning(
     fill(even_board, sft=0.4)
     words = "C1, Fine-tuning without constraint degrades pretrained skills (on 1 of 2 boards)."
     assert f"of 2 verdicts, 1 holds and 1 is undecided. What holds: {words}" in page()
+
+
+def test_the_page_begins_with_the_number_of_claims_by_their_best_verdicts(
+    even_board: Callable[..., Path], page: Callable[[], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    every = (
+        *(judged("C1", "a", "holds", "lost"), judged("C1", "b", "does not hold", "lost")),
+        *(judged("C2", "a", "undecided", "lost"), judged("C5", "a", "holds", "lost")),  # C5 is not counted
+    )
+    monkeypatch.setattr("clbench.leaderboard.claims.judges.judge_all", lambda *_: every)
+    fill(even_board, sft=0.4)
+    counts = "1 holds, 0 hold in part and 1 does not hold on at least one board; 1 is undecided, or cannot be"
+    assert f"Of the papers' 2 claims, {counts} shown, on every board." in page().partition("## Words")[0]
 
 
 def test_a_claim_that_is_algebra_is_not_counted_with_those_that_records_judge(
