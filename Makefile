@@ -84,8 +84,10 @@ records: .venv/installed-libero
 	$(BIN)/clbench run clbench/Fetch-v1 sft experience_replay lora --seeds 1 --policy flow-base
 	$(BIN)/clbench run $(FIXED),clbench/MetaWorldCW-v0 sft frozen joint from_scratch --seeds 3
 	$(BIN)/clbench run $(FIXED) experience_replay --seeds 3
-	$(BIN)/python docs/guide/online_sac.py clbench/PointMaze-v1 --seeds 3
-	$(BIN)/python docs/guide/online_sac.py clbench/PointMaze-v1 --seeds 3 --replay
+	for id in PointMaze-v1 DMControl-v0; do \
+		$(BIN)/python docs/guide/online_sac.py clbench/$$id --seeds 3 || exit; \
+		$(BIN)/python docs/guide/online_sac.py clbench/$$id --seeds 3 --replay || exit; \
+	done
 	$(BIN)/clbench leaderboard
 
 # The frontier: what a smaller learning rate does, for plain fine-tuning and for the methods that compete with it. The

@@ -70,13 +70,15 @@ def test_the_reference_of_the_command_line_shows_every_command() -> None:
     assert str(ROOT) not in text
 
 
-def test_the_reference_shows_every_public_name() -> None:
+def test_the_reference_shows_every_public_name_and_the_parts_of_a_record() -> None:
     page = (DOCS / "reference" / "api.md").read_text(encoding="utf-8")
     shown = re.findall(r"^\.\. (?:auto|py:)\w+:: clbench\.(\S+)$", page, flags=re.MULTILINE)
     public = {*clbench.__all__} - {"plot"}
     public |= {f"plot.{name}" for name in clbench.plot.__all__}
     public |= {f"testing.{name}" for name in dir(clbench.testing)}
-    assert sorted(shown) == sorted(public)
+    rows = ("EpisodeRow", "AnswerRow", "PolicyRow", "CheckRow")
+    parts = {f"records.record.{name}" for name in ("RunInfo", "ScenarioInfo", *rows, "Relearning", "Costs")}
+    assert sorted(shown) == sorted(public | parts)
 
 
 def _docstrings() -> Iterator[str]:
