@@ -43,5 +43,5 @@ def write_all(texts: Mapping[Path, str]) -> dict[Path, bool]:
 def print_written(written: Mapping[Path, bool]) -> None:
     """Print what `write_all` returned."""
     console = Console()
-    for path, is_new in written.items():
-        print_plain(console, f"{'Written' if is_new else 'Unchanged'}: {path}")
+    for path, is_written in written.items():
+        print_plain(console, f"{'Written' if is_written else 'Unchanged'}: {path}")
