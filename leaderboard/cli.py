@@ -70,8 +70,8 @@ def show(
     from clbench.scoring.metrics import load_metric
 
     from .board.summary import column_names, values_of
-    from .files import print_written
     from .publishing import add_published, inputs_of, read_unchanged, site_of, write_site
+    from .views.files import print_written
     from .views.terminal import terminal
 
     if sort is not None:
@@ -184,9 +184,9 @@ def submit(
     from clbench.runs.spec import RunSpec, check_device
 
     from .board.rows import compute_board
-    from .files import print_written
     from .publishing import inputs_of, site_of, write_site
     from .submission.submit import placement, run_submission
+    from .views.files import print_written
 
     add_cwd_to_path()
     with checked_input():

@@ -24,9 +24,9 @@ from clbench.spec.identifiers import installed_methods
 from .board.frontier import ladder_of
 from .board.paths import CARDS, FILM, beside
 from .board.summary import Summary
-from .files import write_all
 from .policies.decoders import RESULTS
 from .views.csv import csv_text
+from .views.files import write_all
 
 if TYPE_CHECKING:
     from .board.rows import Board
@@ -40,7 +40,7 @@ NUMBERS = "board.json"
 _CODE = (
     *("clbench.base", "clbench.spec", "clbench.records", "clbench.runs", "clbench.scoring"),
     *("clbench.learning", "clbench.metrics", "clbench.leaderboard.board", "clbench.leaderboard.policies"),
-    *("clbench.leaderboard.views", "clbench.leaderboard.files", "clbench.leaderboard.publishing"),
+    *("clbench.leaderboard.views", "clbench.leaderboard.publishing"),
 )
 """Code that the board and its pages depend on, besides the packages of the installed methods."""
 

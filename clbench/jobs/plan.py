@@ -56,7 +56,7 @@ class Plan:
     @property
     def inputs(self) -> list[Job]:
         """The jobs that need no method: data, and pretrained policies."""
-        kinds = (self._questions, self._data, self._policies)
+        kinds = (self._data, self._questions, self._policies)
         return [job for kind in kinds for job in kind.values() if job is not None]
 
     @property

@@ -91,8 +91,8 @@ def method_pages(
         output: Folder of the pages.
     """
     from ..claims.judges import judge_all
-    from ..files import write_all
     from ..views.descriptions import built_in_descriptions
+    from ..views.files import write_all
     from .method_pages import Sources, pages
 
     evidence = _evidence(scenario, records, controls, optional=True)
@@ -194,7 +194,7 @@ def _board(records: Path) -> Board:
 
 def _write(texts: Mapping[Path, str]) -> None:
     """Write texts to their paths, and print the paths."""
-    from ..files import print_written, write_all
+    from ..views.files import print_written, write_all
 
     with checked_input():
         written = write_all(texts)

@@ -26,7 +26,7 @@ from clbench.spec.task import Task
 from clbench.worlds.gl_backend import choose_back_end
 from clbench.worlds.world import opened_worlds
 
-from ..files import write_all
+from ..views.files import write_all
 
 EXPERTS = "experts.json"
 """File with the measurements of the experts, in the folder of the card."""

@@ -41,7 +41,7 @@ from clbench.spec.scenario import Scenario
 from ..board.runs import differences, is_number, read_run
 from ..board.summary import ELSEWHERE
 from ..board.tiers import TIERS, tier_of, verification_path, verification_text
-from ..files import write_all
+from ..views.files import write_all
 from .replay import replay
 from .subject import Check, Request, Subject, some
 

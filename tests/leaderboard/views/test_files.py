@@ -6,8 +6,8 @@ import pytest
 
 from clbench.base.entry_points import resolve
 
-print_written = resolve("clbench.leaderboard.files:print_written")
-write_all = resolve("clbench.leaderboard.files:write_all")
+print_written = resolve("clbench.leaderboard.views.files:print_written")
+write_all = resolve("clbench.leaderboard.views.files:write_all")
 
 
 def test_a_file_that_has_its_text_is_left_alone_and_called_unchanged(
