@@ -76,6 +76,15 @@ def test_the_answers_of_a_kind_are_as_frequent_whatever_the_number_of_answers_of
     assert all(900 < count < 1100 for count in counts), counts
 
 
+def test_an_answer_is_asked_about_every_state_that_gives_it() -> None:
+    kind = QuestionKind(
+        "side", ("which side",), ("left", "right"), lambda states: states[:, 0].astype(int) % 2
+    )
+    questions = Questions((kind,), torch.arange(20.0)[:, None])
+    batch = questions.ask(torch.zeros(1000, dtype=torch.int64), torch.Generator().manual_seed(0))
+    assert sorted(set(batch.state[:, 0].tolist())) == list(range(20))
+
+
 def test_every_evaluation_asks_the_same_questions_as_many_of_each_kind() -> None:
     _, report = load_questions(TOY)
     (kind, first), (_, second) = scored_questions(report, 50), scored_questions(report, 50)

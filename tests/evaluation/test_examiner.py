@@ -2,13 +2,17 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from eager import EAGER
 
 from clbench.data.questions import Questions, scored_questions
 from clbench.data.training_data import TrainingData
+from clbench.evaluation.episodes import Trial
 from clbench.evaluation.examiner import Examiner
+from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.method import Method, Stage
 from clbench.learning.pretraining import policy_config
 from clbench.policy.policy import Policy
@@ -91,3 +95,25 @@ def test_a_tuning_run_looks_at_training_questions_alone_and_the_drift_is_a_mean_
         right = policy.answer_logits(asked.state, asked.words, asked.image).argmax(dim=1) == asked.answer
     assert record.answers["asked"] == torch.bincount(kind).tolist()
     assert record.answers["correct"] == torch.bincount(kind, right.double()).int().tolist()
+
+
+def test_a_tuning_run_plays_validation_episodes_alone_also_for_the_captured_share(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run = RunSpec(EAGER.id, "sft", 0, split="validation").resolve()
+    policy = TransformerPolicy(policy_config(run.scenario))
+    data = TrainingData.open(run.scenario, policy.config)
+    played: list[Trial] = []
+    play = Evaluator.play
+
+    def noted(self: Evaluator, policy: Policy, trials: Any, *rest: Any) -> Any:
+        played.extend(trials)
+        return play(self, policy, trials, *rest)
+
+    monkeypatch.setattr(Evaluator, "play", noted)
+    record = Record("success", run.info, run.scenario_info)
+    examiner = Examiner(run.scenario, run.protocol, data, policy, seed=0)
+    examiner.examine(policy, run.protocol.end(1), record, examiner.predictions(policy, 1))
+    examiner.close()
+    assert record.policy["captured"] != [None]
+    assert {trial.split for trial in played} == {"validation"}

@@ -26,6 +26,15 @@ def test_update_sparsity_counts_single_weights_that_moved_by_less_than_a_thousan
     assert update_sparsity(policy, pretrained) == still / total
 
 
+def test_the_change_of_a_weight_is_a_share_of_what_it_was_and_not_of_what_it_is() -> None:
+    pretrained, policy = TransformerPolicy(SMALL), TransformerPolicy(SMALL)
+    with torch.no_grad():
+        for old, new in zip(pretrained.parameters(), policy.parameters(), strict=True):
+            old.fill_(1.0)
+            new.fill_(1.0 + 1.0005e-3)  # 0.9995e-3 of what it is
+    assert update_sparsity(policy, pretrained) == 0.0
+
+
 def test_a_weight_that_was_0_has_moved_if_it_is_more_than_a_hundred_billionth() -> None:
     pretrained, policy = TransformerPolicy(SMALL), TransformerPolicy(SMALL)
     with torch.no_grad():

@@ -261,3 +261,14 @@ def test_the_episodes_of_a_split_stay_those_of_the_published_records() -> None:
     left = TOY.task("left")
     assert start_of(Trial(left, "test", 3), 5) == (1785073415, "move to the left")
     assert start_of(Trial(left, "validation", 3), 5) == (370372521, "move to the left")
+
+
+def test_actions_are_clipped_before_a_world_gets_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = TransformerPolicy(policy_config(TOY))
+    signs = torch.tensor([3.0, -7.0])
+    monkeypatch.setattr(policy, "act", lambda state, words, noise, image: signs.expand_as(noise).clone())
+    taken: list[Any] = []
+    evaluator = Evaluator(TOY, seed=0)
+    evaluator.play(policy, [Trial(TOY.task("left"), "validation", 0)], watch=lambda _, one: taken.append(one))
+    evaluator.close()
+    np.testing.assert_array_equal(taken, [[1.0, -1.0]] * len(taken))

@@ -295,6 +295,14 @@ def test_jobs_that_are_done_already_are_not_waited_for(tmp_path: Path, bars: Bar
     assert [line.partition(":")[2] for line in printed(bars).splitlines()] == [" done by another command"] * 3
 
 
+def test_a_done_job_keeps_no_lease(tmp_path: Path, bars: Bars, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "x").touch()
+    there: list[list[str]] = []
+    monkeypatch.setattr(bars, "skip", lambda *_: there.append(os.listdir(tmp_path)))
+    assert run_jobs([_claimed("x", tmp_path / "x")], _Two(), bars) == {}
+    assert ".x.lease" not in there[0]
+
+
 def test_without_a_free_worker_the_scheduler_waits_for_one_and_says_so_once(
     bars: Bars, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,9 +7,12 @@ from tiny import TINY
 
 import clbench
 from clbench.base.errors import InputError, UnknownNameError
+from clbench.records.reader import read_record
 from clbench.records.writer import write_record
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
+from clbench.scoring.metrics import measure
+from clbench.scoring.scores import Scores
 
 TOY = "clbench.testing:clbench/Toy-v0"
 
@@ -26,6 +29,17 @@ def test_methods_are_compared_over_the_seeds_that_were_asked_for(
     assert sorted(table.index) == ["frozen", "sft"]  # sft by itself; joint was not asked for
     assert list(table["seeds"]) == [1, 1]
     assert table.loc["frozen", "retention"] > table.loc["sft", "retention"]
+
+
+@pytest.mark.long
+def test_methods_are_compared_over_seeds_from_the_first_one_that_was_asked_for(tmp_path: Path) -> None:
+    for method in ("sft", "frozen"):
+        for seed in (2, 3):
+            execute(RunSpec(TINY.id, method, seed), tmp_path)
+    table = clbench.compare(TINY.id, "frozen", seeds=1, first_seed=3, records=tmp_path).set_index("method")
+    seed_3 = read_record(RunSpec(TINY.id, "sft", 3).path(tmp_path))
+    assert list(table["seeds"]) == [1, 1]
+    assert table.loc["sft", "retention"] == measure("retention", Scores.from_record(seed_3))
 
 
 @pytest.mark.long

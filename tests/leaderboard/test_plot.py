@@ -42,6 +42,14 @@ def test_a_matrix_shows_each_stage_on_each_task_and_frames_what_was_learned(
     assert "var(--" not in svg
 
 
+def test_a_matrix_of_several_runs_is_their_mean(record: Callable[..., Record]) -> None:
+    lucky = record(seed=1)
+    lucky.episodes["success"] = [1] * len(lucky.episodes["success"])
+    cells = plot.matrix([record(), lucky]).spec["data"]["values"]
+    shown = np.reshape([cell["success"] for cell in cells], np.shape(RATES))
+    np.testing.assert_allclose(shown, (np.array(RATES) + 1) / 2, atol=5e-4)  # of three digits
+
+
 def test_runs_in_other_orders_of_the_targets_have_them_numbered(record: Callable[..., Record]) -> None:
     first, other = record(), record(seed=1)
     other.scenario.target.reverse()
@@ -92,6 +100,18 @@ def test_runs_that_do_not_belong_together_are_refused(
         plot.curves(record(), make_record(RATES, episodes=8))
     with pytest.raises(RecordError, match=r"gone\.json: cannot be read"):
         plot.curves(tmp_path / "gone.json")
+
+
+def test_a_plane_is_that_of_the_scenario_with_most_rows(
+    record: Callable[..., Record], tmp_path: Path
+) -> None:
+    rows = {"clbench/A-v0": ["sft"], "clbench/B-v0": ["sft", "lora"], "clbench/C-v0": ["lora"]}
+    for scenario, methods in rows.items():
+        for method in methods:
+            path = record_path(tmp_path, scenario, method, 0)
+            write_record(record(scenario=scenario, method=method), path)
+    points = plot.plane(tmp_path).spec["datasets"]["points"]
+    assert sorted(point["method"] for point in points) == ["lora", "sft"]
 
 
 @pytest.mark.long

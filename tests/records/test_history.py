@@ -118,6 +118,13 @@ def test_fields_that_follow_from_the_budget_of_schema_1_are_filled_in() -> None:
     assert not record.policy["stage"]
 
 
+def test_evaluation_steps_of_schema_1_are_rounded_to_the_nearest_step(tmp_path: Path) -> None:
+    values = json.loads((HISTORIC / "schema-1" / "Fetch-v0-sft-seed-0.json").read_text(encoding="utf-8"))
+    values["scenario"]["budget"] |= {"adaptation_steps": 11, "evaluation_points": 4}
+    (tmp_path / "record.json").write_text(json.dumps(values), encoding="utf-8")
+    assert read_record(tmp_path / "record.json").scenario.evaluation_steps == [3, 6, 8, 11]
+
+
 OLD = {1: HISTORIC / "schema-1" / "Fetch-v0-sft-seed-0.json"}
 OLD[4] = HISTORIC / "schema-4" / "Fetch-v1-sft-seed-0.json"
 OLD[3] = HISTORIC / "schema-3" / "Fetch-v1-sft-tuning.json"

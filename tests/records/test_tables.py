@@ -30,6 +30,19 @@ def test_a_record_has_a_labelled_matrix_that_equals_its_scores(records: Path) ->
     assert len(record.frame()) == len(record.episodes["task"])
 
 
+def test_a_matrix_names_the_stages_by_the_targets_in_the_order_in_which_they_were_learned(
+    make_record: Callable[..., Record],
+) -> None:
+    record = make_record(RATES, episodes=4)
+    swapped = dict(zip(record.scenario.target, reversed(record.scenario.target), strict=True))
+    record.scenario.target.reverse()
+    record.episodes["task"] = [swapped.get(task, task) for task in record.episodes["task"]]
+    matrix = record.matrix()
+    assert list(matrix.index) == ["pretrained", "target_1", "target_0"]
+    assert list(matrix["target"]) == ["target_1", "target_0"]
+    np.testing.assert_allclose(matrix.to_numpy(), RATES)
+
+
 def test_records_and_scenarios_say_in_a_line_what_they_are(records: Path) -> None:
     record = clbench.read_record(next(records.rglob("seed-0.json")))
     assert repr(record).startswith("<Record of sft on clbench/Toy-v0, seed 0: success, ")

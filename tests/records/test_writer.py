@@ -84,6 +84,19 @@ def test_a_full_disk_leaves_no_torn_copy_of_a_record_of_other_settings(
     assert (list(tmp_path.iterdir()), path.read_bytes()) == ([path], before)
 
 
+def test_a_record_without_perturbed_episodes_does_not_replace_one_that_has_them(
+    record: Record, tmp_path: Path
+) -> None:
+    path = tmp_path / "seed-0.json"
+    perturbed = dataclasses.replace(record, run=dataclasses.replace(record.run, perturb=True))
+    write_result(perturbed, path)
+    write_result(record, path)
+    assert read_record(path) == record
+    assert read_record(tmp_path / "seed-0.json.old") == perturbed
+    write_result(perturbed, path)  # it holds all that the other one does
+    assert len(list(tmp_path.iterdir())) == 2
+
+
 def test_diagnostics_with_tuples_and_numbers_as_names_can_be_read(record: Record, tmp_path: Path) -> None:
     record.diagnostics = {"1": {2: (1.0, 2.0), 10: "x"}}
     write_record(record, tmp_path / "record.json")
@@ -172,3 +185,12 @@ def test_a_record_that_could_not_be_read_again_is_not_written(
     with pytest.raises(InputError, match=words):
         write_record(record, tmp_path / "record.json")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_record_that_could_not_be_read_again_leaves_the_one_before(record: Record, tmp_path: Path) -> None:
+    write_record(record, tmp_path / "record.json")
+    before = (tmp_path / "record.json").read_bytes()
+    damage_columns(record)
+    with pytest.raises(InputError, match="different lengths"):
+        write_record(record, tmp_path / "record.json")
+    assert (tmp_path / "record.json").read_bytes() == before

@@ -96,6 +96,23 @@ def test_neither_the_warm_up_nor_one_disturbed_block_changes_the_ratio(
 
 
 @pytest.mark.long
+def test_the_first_pair_of_blocks_does_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seconds = iter([10.0, 1.0, 3.0, 1.0])  # of the method and of plain fine-tuning, in turn
+    monkeypatch.setattr("clbench.runs.step_time.ROUNDS", 2)
+    monkeypatch.setattr("clbench.runs.step_time._seconds", lambda *_: next(seconds))
+    assert _timing("l2_sp", tmp_path)["step_ratio"] == 3
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("_a_second_for_each_loss")
+def test_a_stage_without_a_step_more_than_a_block_is_too_short(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("clbench.runs.step_time.STEPS", TINY.budget.adaptation_steps)
+    assert _timing("l2_sp", tmp_path)["step_ratio"] is None
+
+
+@pytest.mark.long
 @pytest.mark.usefixtures("_a_second_for_each_loss")
 def test_a_method_that_trains_nothing_has_no_time_of_a_step_and_plain_fine_tuning_is_the_unit(
     tmp_path: Path,

@@ -122,6 +122,11 @@ def test_the_first_of_equal_settings_wins() -> None:
     assert best_of([first, second]) is first
 
 
+def test_where_none_learns_enough_only_those_that_learn_most_are_equals() -> None:
+    less, most, equal = _tried(0.7, 0.3, 1.0), _tried(0.5, 0.6, 0.3), _tried(0.4, 0.6, 0.1)
+    assert rated_best([less, most, equal]) == [most, equal]
+
+
 def test_a_setting_that_learns_too_little_is_no_equal_of_the_best() -> None:
     lazy, best, equal = _tried(0.6, 0.79, 1.0), _tried(0.6, 0.9, 0.3), _tried(0.6, 0.8, 0.1)
     assert best_of([lazy, best, equal]) is best

@@ -210,3 +210,11 @@ def test_a_difference_may_be_as_large_as_both_ends_of_a_metric_are_apart(
     expected = interval_of_seeds(differences.mean(), stats.sem(differences), 2, (-2.0, 2.0))
     assert (found.low, found.high) == pytest.approx(expected)
     assert expected[1] > 1
+
+
+def test_a_ratio_of_one_seed_has_the_percentiles_of_the_logarithms_of_its_draws() -> None:
+    drawn = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
+    got = interval(4.0, np.zeros(0), lambda: drawn, ratio=True)
+    ends = np.exp(np.percentile(np.log(drawn), [2.5, 97.5]))
+    assert (got.low, got.high) == pytest.approx(tuple(ends))
+    assert not got.of_seeds

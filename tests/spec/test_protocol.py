@@ -118,3 +118,10 @@ def test_a_budget_with_a_criterion_has_its_checks_and_one_evaluation_point() -> 
     assert budget.check_steps == check_steps(50)
     assert budget.evaluation_steps == (50,)
     assert Budget().check_steps == ()
+
+
+def test_a_goal_is_a_whole_number_of_successes_whatever_the_last_bit_of_the_criterion() -> None:
+    hundred = dataclasses.replace(PROTOCOL, validation_episodes=100)
+    assert 0.55 * 100 > 55
+    goals = [dataclasses.replace(hundred, criterion=one).goal for one in (0.5, 0.501, 0.55, 1.0)]
+    assert goals == [50, 51, 55, 100]

@@ -195,3 +195,17 @@ def test_the_seeds_that_would_decide_are_those_whose_interval_ends_at_the_bar(di
     halves = {n: stats.t.ppf(0.975, n - 1) * deviation / n**0.5 for n in range(4, 101)}
     needed = next((f"about {n}" for n, half in halves.items() if half <= distance), "more than 100")
     assert f"At this spread {needed} seeds: " in what_would_change(figure, 0.05)
+
+
+def test_a_run_in_another_order_of_the_targets_is_no_evidence(bench: Bench, add: Callable[..., None]) -> None:
+    for seed in range(2):
+        add("sft", seed, [[1, 1, 0, 0, 0], [1, 1, 1, 0, 0], [0.5, 0.5, 1, 1, 0]])
+    success = [[1, 1, 0, 0, 0], [1, 1, 1, 0, 0], [0, 0, 1, 1, 0]]
+    record = bench.make_record(success, groups=(2, 2, 1), seed=2, order=1)
+    swapped = dict(zip(record.scenario.target, reversed(record.scenario.target), strict=True))
+    record.scenario.target.reverse()
+    record.episodes["task"] = [swapped.get(task, task) for task in record.episodes["task"]]
+    write_record(record, record_path(bench.folder / "records", TOY.id, "sft", 2, 1))
+    evidence = bench.evidence()
+    found = evidence.metric("retention", "sft")
+    assert (found.value, found.seeds, evidence.not_used) == (0.5, (0, 1), ())

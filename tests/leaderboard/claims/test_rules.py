@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 from claims_bench import Bench
+from stated_evidence import FORGETS, judged
 
 from clbench.base.entry_points import resolve
 from clbench.records.record import Record
@@ -375,3 +376,11 @@ def test_what_a_control_says_follows_from_the_interval_of_the_gain(
 ) -> None:
     gain = Figure("kept", ("consft", "finch"), Estimate((low + high) / 2, low, high))
     assert not_told_apart(gain, explains="a learning rate suffices", does_not="it takes weights") == says
+
+
+def test_an_objective_that_may_save_steps_does_not_keep_a_vector_from_being_judged() -> None:
+    given = {
+        f"steps to the criterion, {CO_TRAINING} / sft@1": (0.949, 1.2),
+        f"steps to the criterion, {VECTOR} / {NO_REGULARISER}": (0.5, 0.949),
+    }
+    assert judged("F3", {**FORGETS, **given}).verdict == "holds"

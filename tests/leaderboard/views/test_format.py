@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from clbench.base.entry_points import resolve
+from clbench.scoring.scores import WEAK, WEAK_WARNING
 
 agreement_text = resolve("clbench.leaderboard.views.format:agreement_text")
 machine_text = resolve("clbench.leaderboard.views.format:machine_text")
@@ -17,6 +18,7 @@ tier_text = resolve("clbench.leaderboard.views.format:tier_text")
 tiers_text = resolve("clbench.leaderboard.views.format:tiers_text")
 aligned = resolve("clbench.leaderboard.views.format:aligned")
 standing_text = resolve("clbench.leaderboard.views.format:standing_text")
+start_text = resolve("clbench.leaderboard.views.format:start_text")
 compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 
 
@@ -95,3 +97,8 @@ def test_runs_that_did_not_begin_like_plain_fine_tuning_are_named_with_a_way_out
         "Their gain compares unlike runs. To mend it, run sft and these methods on one machine with "
         "a new --records folder."
     )
+
+
+def test_a_pretrained_policy_at_the_bar_is_not_weak() -> None:
+    assert start_text(WEAK) == "The pretrained policy succeeds in 0.80 of the episodes of its skills."
+    assert start_text(WEAK - 0.01).endswith(WEAK_WARNING)

@@ -1,5 +1,6 @@
 """The table in the terminal."""
 
+import dataclasses
 import io
 import json
 from collections.abc import Callable
@@ -13,6 +14,7 @@ from rich.console import Console
 
 from clbench.base.entry_points import resolve
 from clbench.cli.main import app
+from clbench.scoring.intervals import Estimate
 
 
 def test_the_terminal_shows_all_rows_in_108_columns(
@@ -63,6 +65,16 @@ def test_the_best_of_a_division_is_bold_and_a_lone_row_is_not(
     assert "\x1b[1m" in better
     assert "\x1b[1m" not in lone
     assert better.count("\x1b[1m") > sft.count("\x1b[1m")
+
+
+def test_the_number_after_a_value_is_half_the_width_of_its_interval(four_methods: Path) -> None:
+    table = resolve("clbench.leaderboard.board.rows:compute_board")(four_methods)
+    uneven = {**table.rows[0].estimates, "retention": Estimate(0.9, 0.5, 0.94)}
+    (row, *_) = table.rows
+    only = dataclasses.replace(table, rows=(dataclasses.replace(row, estimates=uneven),))
+    printed = io.StringIO()
+    Console(width=108, file=printed).print(resolve("clbench.leaderboard.views.terminal:terminal")(only, 108))
+    assert "0.90±.22" in printed.getvalue()
 
 
 @pytest.mark.long

@@ -123,6 +123,17 @@ def test_a_leader_that_is_not_told_apart_is_said_to_be_so(board: Callable[..., A
     )
 
 
+def test_the_method_that_keeps_most_is_found_on_the_seeds_of_plain_fine_tuning(
+    add: Callable[..., Path], tmp_path: Path
+) -> None:
+    for seed, luck in enumerate((0.0, 0.1, 0.5, 0.6)):  # the last seeds keep more, whatever the method
+        for method, kept in {"sft": 0.1, "lora": 0.3, "finch": 0.2}.items():
+            if method == "finch" or seed < 2:
+                add(method, seed, matrix(kept + luck))
+    (verdict,) = verdicts(compute_board(tmp_path / "leaderboard" / "records").rows)
+    assert "it keeps the most (0.35)" in verdict.keeping  # finch has 0.50 in the mean of its four seeds
+
+
 def test_the_one_method_that_is_not_told_apart_from_a_leader_is_named(board: Callable[..., Any]) -> None:
     (verdict,) = verdicts(board(sft=matrix(0.5), lora=matrix(0.6)))
     assert verdict.standing.endswith("it is first of 2; sft is not told apart from it.")

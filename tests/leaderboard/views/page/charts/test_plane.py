@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from clbench.base.entry_points import resolve
+from clbench.scoring.intervals import Estimate
 
 Plane = resolve("clbench.leaderboard.views.page.charts.plane:Plane")
 PLANE = "clbench.leaderboard.views.page.charts.plane"
@@ -90,3 +91,19 @@ def test_every_place_of_the_template_is_filled(rows: Any) -> None:
 def test_one_method_of_a_division_has_no_front(rows: Any) -> None:
     assert Plane(rows, learned, kept).corners
     assert not Plane([row for row in rows if row.method != "heavy"], learned, kept).corners
+
+
+def test_the_front_has_the_methods_that_no_cheaper_one_matches(rows: Any) -> None:
+    competing = [row for row in rows if row.division != "reference"]
+    priced = [
+        dataclasses.replace(
+            competing[0],
+            method=name,
+            costs={**competing[0].costs, "relative_cost": price},
+            estimates={**competing[0].estimates, "kept": Estimate(success, None, None)},
+        )
+        for name, price, success in (("cheap", 1.0, 0.5), ("good", 4.0, 0.9), ("worse", 8.0, 0.7))
+    ]
+    corners = {(corner["x"], corner["y"]) for corner in Plane(priced, cost, kept).corners}
+    assert {(1.0, 0.5), (4.0, 0.9)} < corners
+    assert (8.0, 0.7) not in corners
