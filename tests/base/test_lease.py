@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -92,6 +93,19 @@ def test_a_lease_without_a_heartbeat_is_taken_over_where_names_cannot_be_exchang
         assert leases.SECONDS < time.monotonic() - begin < 60
         assert [path.name for path in tmp_path.iterdir()] == [".x.lease"]
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("_like_nfs")
+def test_a_lease_without_a_heartbeat_is_removed_after_one_and_a_half_times_its_seconds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lease_path(tmp_path / "x").touch()
+    lease, now = Lease(tmp_path / "x"), [0.0]
+    monkeypatch.setattr(leases, "time", SimpleNamespace(monotonic=lambda: now[0], time=time.time))
+    for times, taken in ((0.0, False), (1.4, False), (1.6, True)):
+        now[0] = times * leases.SECONDS
+        assert lease.take() == taken
+    lease.release()
 
 
 @pytest.mark.usefixtures("_like_nfs")
