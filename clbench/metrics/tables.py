@@ -47,8 +47,9 @@ class _Line:
 
 
 def is_table(name: str) -> bool:
-    """Return whether a name is meant as a table: it ends in .csv, or a file has it."""
-    return name.lower().endswith(".csv") or os.path.isfile(name)  # False for a name that is too long
+    """Return whether a name is meant as a table: it is a path, ends like a table's, or a file has it."""
+    ends = name.lower().endswith((".csv", ".tsv", ".txt"))
+    return ends or os.sep in name or os.path.isfile(name)  # False for a name that is too long
 
 
 def find(name: Path | str) -> Path:

@@ -169,11 +169,22 @@ def openpi_policy(
         noise: Shape of the noise that `infer(observation, noise=...)` starts from: the horizon and the size
             of an action inside the model. It is drawn from seed and step, so that outcomes repeat themselves.
             None lets the policy draw its own.
+
+    Returns:
+        A function that raises TypeError if `infer` returns something else.
     """
 
     def infer(row: Observations) -> Any:
         drawn = {} if noise is None else {"noise": _noise(row["seed"], row["step"], noise)}
-        return policy.infer(observation(row), **drawn)["actions"]
+        found = policy.infer(observation(row), **drawn)
+        if not isinstance(found, Mapping) or "actions" not in found:
+            what = (
+                f"one with {', '.join(map(str, found))}"
+                if isinstance(found, Mapping)
+                else type(found).__name__
+            )
+            raise TypeError(f"infer() must return a dictionary with `actions`, (H, A), not {what}.")
+        return found["actions"]
 
     def act(observations: Observations) -> NDArray[Any]:
         count = len(observations["state"])

@@ -42,6 +42,8 @@ LEARNING_STEPS = 80
 
 LEAST_FALL = 0.25
 """Least share by which the loss falls. The built-in policies lose 94 and 90 % of it in these steps."""
+FARTHEST = 1.0
+"""Greatest mean distance from the demonstrated actions after these steps: half the range of actions."""
 
 PAGE = "docs/guide/your_policy.md"
 
@@ -241,8 +243,14 @@ def learning(subject: Subject) -> None:
         found = f"mean actions {left.tolist()} for `go left` and {up.tolist()} for `go up`"
         raise _breach(learning, "actions that follow the instruction", found, "act()")
     chunk = _act(policy, batch)
+    distance = float((chunk - batch.action).abs().mean())
+    if distance > FARTHEST:
+        expected = (
+            f"actions in the units of the world, on average within {FARTHEST:g} of the demonstrated ones"
+        )
+        raise _breach(learning, expected, f"{distance:.3g}", "act()")
     normalised = (batch.action - policy.action_mean) / policy.action_std
-    if (chunk - normalised).abs().mean() < (chunk - batch.action).abs().mean():
+    if (chunk - normalised).abs().mean() < distance:
         expected = "actions in the units of the world: action_mean + action_std * the normalised ones"
         raise _breach(learning, expected, "actions nearer to the normalised ones", "act()")
     chunk = _act(policy, seen)

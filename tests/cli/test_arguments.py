@@ -144,6 +144,8 @@ def test_a_path_may_begin_with_the_home_folder(
         (["claims", "--records", "nowhere"], "There is no folder of records at nowhere."),
         (["findings", "--records", "nowhere"], "There is no folder of records at nowhere."),
         (["metrics", "forgeting"], "No metric is called 'forgeting'. Did you mean 'forgetting'?"),
+        (["metrics", "rates.txt"], "There is no file 'rates.txt'."),
+        (["metrics", "/"], "'/' is a folder, not a file."),
         (["leaderbord"], "No command is called 'leaderbord'. Did you mean 'leaderboard'?"),
         (["run"], "SCENARIOS requires an argument"),
         (["experts", "mesure"], "No command is called 'mesure'. Did you mean 'measure'?"),

@@ -254,6 +254,14 @@ class Unscaled(Base):
         return (super().act(state, words, noise, image) - self.action_mean) / self.action_std
 
 
+class Saturated(Base):
+    """Returns actions in thousandths of the world's units."""
+
+    @torch.inference_mode()
+    def act(self, state: Tensor, words: Tensor, noise: Tensor, image: Tensor | None = None) -> Tensor:
+        return 1000 * super().act(state, words, noise, image)
+
+
 class Boastful(Plain):
     """Declares an ability that there is not."""
 
@@ -328,6 +336,7 @@ BROKEN: list[tuple[type[Policy], str, str]] = [
     (Deaf, "learning", "for `go left`"),
     (Stubborn, "learning", "a loss of at most"),
     (Unscaled, "learning", "actions in the units of the world"),
+    (Saturated, "learning", "within 1 of the demonstrated ones"),
     (Forgetful, "checkpoints", "a loaded policy acts otherwise"),
     (Averaging, "checkpoints", "a loaded policy acts otherwise"),
     (Boastful, "abilities", "telepathy"),
