@@ -7,8 +7,9 @@ be computed from these are not stored.
 from __future__ import annotations
 
 import html
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 from clbench.base.text import printable
 from clbench.spec.policies import DEFAULT_POLICY
@@ -28,6 +29,9 @@ point has."""
 
 FARTHEST = 1e18
 """An activation drift or shift above this comes from a policy that diverged, and is recorded as None."""
+
+
+Row = TypeVar("Row")
 
 
 class EpisodeRow(NamedTuple):
@@ -299,19 +303,19 @@ class Record:
 
     def episode_rows(self) -> list[EpisodeRow]:
         """Return the rows of `episodes`."""
-        return [EpisodeRow(*values) for values in zip(*self.episodes.values(), strict=True)]
+        return _rows(EpisodeRow, self.episodes)
 
     def answer_rows(self) -> list[AnswerRow]:
         """Return the rows of `answers`."""
-        return [AnswerRow(*values) for values in zip(*self.answers.values(), strict=True)]
+        return _rows(AnswerRow, self.answers)
 
     def policy_rows(self) -> list[PolicyRow]:
         """Return the rows of `policy`."""
-        return [PolicyRow(*values) for values in zip(*self.policy.values(), strict=True)]
+        return _rows(PolicyRow, self.policy)
 
     def check_rows(self) -> list[CheckRow]:
         """Return the rows of `checks`."""
-        return [CheckRow(*values) for values in zip(*self.checks.values(), strict=True)]
+        return _rows(CheckRow, self.checks)
 
     @property
     def failure(self) -> str | None:
@@ -344,6 +348,10 @@ class Record:
     def add_policy(self, row: PolicyRow) -> None:
         """Append a row to `policy`."""
         _append(self.policy, row)
+
+
+def _rows(row: Callable[..., Row], columns: dict[str, list[Any]]) -> list[Row]:
+    return [row(*values) for values in zip(*columns.values(), strict=True)]
 
 
 def _append(columns: dict[str, list[Any]], row: tuple[Any, ...]) -> None:

@@ -111,9 +111,11 @@ def _of_baseline(run: ResolvedRun) -> ResolvedRun:
 def _kept(run: ResolvedRun, policy: Policy) -> tuple[Path, dict[str, Any]]:
     """Return the folder of an evaluation in the cache, and everything that it depends on."""
     spec = run.spec
-    own = {"method": describe_method(run.method), "settings": run.info.settings}
+    own = {}
+    if not starts_as_pretrained(run):
+        own = {"method": describe_method(run.method), "settings": run.info.settings}
     inputs = {
-        **({} if starts_as_pretrained(run) else own),
+        **own,
         "policy": hash_of_tensors(policy.state_dict()),
         "scenario": dataclasses.asdict(run.scenario_info),
         "spec": [spec.seed, spec.device, spec.split, spec.perturb],

@@ -22,6 +22,9 @@ from .evidence import Evidence, Figure
 
 Verdict = Literal["holds", "holds in part", "does not hold", "undecided", "cannot be shown here"]
 
+DECIDED: tuple[Verdict, ...] = ("holds", "holds in part", "does not hold")
+"""Verdicts that are a yes or a no."""
+
 PREDICATES: Mapping[Verdict, tuple[str, str]] = {
     "holds": ("holds", "hold"),
     "holds in part": ("holds in part", "hold in part"),

@@ -18,7 +18,7 @@ from clbench.spec.references import BASELINE, FROZEN
 from ..board.predictors import predictions
 from ..board.rows import Board, Row, certain_sides
 from ..board.summary import WITH_DEMONSTRATIONS, WITHOUT_DEMONSTRATIONS, grouped, tables_of
-from ..claims.claim import KNOWLEDGE, PREDICATES, Claim, Verdict, tally
+from ..claims.claim import DECIDED, KNOWLEDGE, PREDICATES, Claim, Verdict, tally
 from ..claims.evidence import Evidence
 from ..claims.judges import Judged
 from ..policies.compared import by_table
@@ -119,10 +119,9 @@ def _claims_in_short(judged: Sequence[Judged]) -> list[str]:
     verdicts = grouped((one.claim, one.finding.verdict) for one in judged if not one.claim.uncounted)
     if not verdicts:
         return []
-    decided: tuple[Verdict, ...] = ("holds", "holds in part", "does not hold")
-    numbers = {one: sum(one in found for found in verdicts.values()) for one in decided}
+    numbers = {one: sum(one in found for found in verdicts.values()) for one in DECIDED}
     counts = listed([f"{number} {PREDICATES[one][number != 1]}" for one, number in numbers.items()])
-    others = sum(not set(decided) & set(found) for found in verdicts.values())
+    others = sum(not set(DECIDED) & set(found) for found in verdicts.values())
     return [
         f"Of the papers' {counted(len(verdicts), 'claim')}, {counts} on at least one board; {others} "
         f"{'is' if others == 1 else 'are'} undecided, or cannot be shown, on every board."
@@ -251,7 +250,7 @@ def _explanations(judged: Sequence[Judged]) -> list[str]:
     told = grouped(
         ((one.claim, sentence), one.evidence.scenario)
         for one in judged
-        if one.finding.verdict in ("holds", "holds in part", "does not hold")
+        if one.finding.verdict in DECIDED
         for sentence in one.finding.sentences[-1:]
     )
     return [

@@ -96,7 +96,7 @@ def test_unchanged_records_show_the_same_board_without_being_read(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("what", ["record", "verification", "table", "numbers", "one value", "code"])
+@pytest.mark.parametrize("what", ["record", "verification", "table", "pipe", "numbers", "one value", "code"])
 def test_a_board_is_computed_again_when_something_changed_that_it_was_made_from(
     what: str, four_methods: Path, shown: Callable[[], tuple[str, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -109,6 +109,9 @@ def test_a_board_is_computed_again_when_something_changed_that_it_was_made_from(
         next(four_methods.rglob("seed-1.json")).with_suffix(".verified").write_text("{}", encoding="utf-8")
     elif what == "table":
         (site / "LEADERBOARD.md").write_text("forged", encoding="utf-8")
+    elif what == "pipe":  # opening it would wait for a writer
+        (site / "LEADERBOARD.md").unlink()
+        os.mkfifo(site / "LEADERBOARD.md")
     elif what == "numbers":
         (site / "board.json").write_bytes(before["board.json"][:-100])
     elif what == "one value":
@@ -120,7 +123,7 @@ def test_a_board_is_computed_again_when_something_changed_that_it_was_made_from(
     assert ("not shown" in printed.lower()) == ("not shown" in first.lower())
     after = {path.name: path.read_bytes() for path in site.iterdir()}
     assert ("retrained" in printed) == ("retrained" in first)
-    if what in ("table", "numbers", "one value"):
+    if what in ("table", "pipe", "numbers", "one value"):
         assert after == before
     else:
         assert after["board.json"] != before["board.json"]

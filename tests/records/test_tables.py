@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas
 import pytest
-from helpers import RATES, write_two_records
+from helpers import RATES, reverse_targets, write_two_records
 
 import clbench
 from clbench.records.record import Record
@@ -34,9 +34,7 @@ def test_a_matrix_names_the_stages_by_the_targets_in_the_order_in_which_they_wer
     make_record: Callable[..., Record],
 ) -> None:
     record = make_record(RATES, episodes=4)
-    swapped = dict(zip(record.scenario.target, reversed(record.scenario.target), strict=True))
-    record.scenario.target.reverse()
-    record.episodes["task"] = [swapped.get(task, task) for task in record.episodes["task"]]
+    reverse_targets(record)
     matrix = record.matrix()
     assert list(matrix.index) == ["pretrained", "target_1", "target_0"]
     assert list(matrix["target"]) == ["target_1", "target_0"]

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from claims_bench import Bench
-from helpers import set_in
+from helpers import reverse_targets, set_in
 from scipy import stats
 
 from clbench.base.entry_points import resolve
@@ -202,9 +202,7 @@ def test_a_run_in_another_order_of_the_targets_is_no_evidence(bench: Bench, add:
         add("sft", seed, [[1, 1, 0, 0, 0], [1, 1, 1, 0, 0], [0.5, 0.5, 1, 1, 0]])
     success = [[1, 1, 0, 0, 0], [1, 1, 1, 0, 0], [0, 0, 1, 1, 0]]
     record = bench.make_record(success, groups=(2, 2, 1), seed=2, order=1)
-    swapped = dict(zip(record.scenario.target, reversed(record.scenario.target), strict=True))
-    record.scenario.target.reverse()
-    record.episodes["task"] = [swapped.get(task, task) for task in record.episodes["task"]]
+    reverse_targets(record)
     write_record(record, record_path(bench.folder / "records", TOY.id, "sft", 2, 1))
     evidence = bench.evidence()
     found = evidence.metric("retention", "sft")
