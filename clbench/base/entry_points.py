@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import os
+import pkgutil
+import sys
 from collections.abc import Iterable
 from typing import Any
 
@@ -55,6 +58,8 @@ def import_module(module: str, needed_for: str) -> Any:
     except ClbenchError:
         raise
     except ModuleNotFoundError as error:
+        if not hint and error.name == module.partition(".")[0]:  # else a module that it imports is missing
+            hint = _hint_of_folder(error.name)
         raise UnknownNameError(
             f"No module {error.name!r} can be imported for {needed_for!r}.{hint}"
         ) from error
@@ -63,6 +68,30 @@ def import_module(module: str, needed_for: str) -> Any:
             raise
         what = f"{type(error).__name__}: {error}"
         raise InputError(f"The module {module!r} cannot be imported for {needed_for!r}: {what}") from error
+
+
+def _hint_of_folder(name: str) -> str:
+    """Return the end of a message: the module of the working directory nearest to `name`, or that none is."""
+    folder = os.getcwd()
+    if not {"", folder} & set(sys.path):  # such as in a script of another folder
+        return ""
+    near = did_you_mean(name, (one.name for one in pkgutil.iter_modules([folder])))
+    return near or f" No installed package has this name, and no file in {folder}."
+
+
+def class_hint(name: str) -> str:
+    """Return the end of a message for a file, a module or a dotted name where "module:Class" belongs."""
+    stem = name.removesuffix(".py").removeprefix("./").replace("/", ".")
+    module, _, attribute = stem.rpartition(".")
+    if not is_module(stem):
+        return ""
+    if name.endswith(".py"):
+        return f" Did you mean a class of this file, as {f'{stem}:Class'!r}?"
+    if module and attribute[0].isupper():
+        return f" Did you mean {f'{module}:{attribute}'!r}?"
+    if module or stem in (one.name for one in pkgutil.iter_modules([os.getcwd(), *sys.path])):
+        return f" Did you mean a class of this module, as {f'{stem}:Class'!r}?"
+    return ""
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:

@@ -19,6 +19,7 @@ from clbench.base.source import class_hash, has_source, package_of, source_hash
 from clbench.base.text import did_you_mean
 from clbench.learning.hooks import misdeclared, misfits, uncalled_functions
 from clbench.learning.method import Method
+from clbench.policy.policy import Policy
 from clbench.spec.identifiers import built_in_methods, installed_methods, unknown_method
 
 
@@ -43,7 +44,9 @@ def load_method(spec: str) -> type[Method]:
     else:
         raise unknown_method(spec)
     if not (isinstance(cls, type) and issubclass(cls, Method)):
-        raise WrongTypeError(f"{spec!r} is not a subclass of clbench.Method.")
+        is_policy = isinstance(cls, type) and issubclass(cls, Policy)
+        hint = f" It is a policy: give it as `--policy {spec}`." if is_policy else ""
+        raise WrongTypeError(f"{spec!r} is not a subclass of clbench.Method.{hint}")
     if "__dataclass_fields__" not in vars(cls):  # it inherits those of Method
         raise WrongTypeError(f"{spec!r} is not a dataclass: decorate it with @dataclasses.dataclass.")
     for name, hint in uncalled_functions(cls).items():

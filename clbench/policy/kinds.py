@@ -41,16 +41,16 @@ def check_abilities(kind: str, needs: Iterable[str], method: str) -> None:
         method: Name of the method, for the message.
 
     Raises:
-        UnknownNameError: There is no such ability.
+        UnknownNameError: The method needs an ability that does not exist, or the policy declares one.
         WrongTypeError: The abilities of the policy are no set.
         InputError: The policy lacks some of them.
     """
-    for need in needs:
-        if need not in ABILITIES:
-            raise unknown("ability of a policy", need, ABILITIES)
     offered = policy_class(kind).abilities
     if not isinstance(offered, frozenset | set):
         raise WrongTypeError(f"{kind}: abilities must be a set of texts, not {offered!r}.")
+    for ability in (*needs, *offered):
+        if ability not in ABILITIES:
+            raise unknown("ability of a policy", ability, ABILITIES)
     missing = sorted(set(needs) - offered)
     if missing:
         raise InputError(

@@ -11,6 +11,9 @@ from clbench.base.entry_points import is_entry_point
 from clbench.base.errors import InputError, WrongTypeError
 from clbench.base.text import quoted
 
+LONGEST = 100
+"""Largest number of characters of a name."""
+
 
 def is_whole(value: Any) -> bool:
     """Return whether a value is a whole number, of Python or of NumPy; True and 1.0 are none."""

@@ -12,12 +12,11 @@ from collections.abc import Iterable
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 
-from clbench.base.entry_points import unknown
+from clbench.base.entry_points import class_hint
 from clbench.base.errors import InputError, UnknownNameError
 from clbench.base.text import did_you_mean, quoted
-
-LONGEST = 100
-"""Largest number of characters of a name."""
+from clbench.spec.fields import LONGEST
+from clbench.spec.policies import policy_names
 
 LONGEST_LABEL = 200
 """Largest number of characters of a method with its changed settings; file systems allow 255."""
@@ -65,21 +64,31 @@ def check_known(scenarios: Iterable[str], methods: Iterable[str]) -> None:
         if ":" not in name and name not in scenario_ids():
             if name in built_in_methods() or name in installed_methods():
                 raise UnknownNameError(f"{name!r} is a method: the scenario comes first, then its methods.")
-            raise unknown("scenario", name, scenario_ids())
+            raise unknown_scenario(name)
     for name in methods:
         if ":" not in name and name not in built_in_methods() and name not in installed_methods():
             raise unknown_method(name)
 
 
+def unknown_scenario(name: str) -> UnknownNameError:
+    """Return the error for an id, or "module:id", under which no scenario is registered."""
+    module, _, name = name.rpartition(":")
+    known = scenario_ids()
+    hint = did_you_mean(name, known)
+    if module:
+        hint += f" The module {module!r} was imported, and does not register it."
+    elif "/" in name and name.partition("/")[0] != "clbench":
+        hint += f" If a module of yours registers it, name the module too, as {f'module:{name}'!r}."
+    return UnknownNameError(f"No scenario is called {name!r}.{hint} Known: {', '.join(known)}.")
+
+
 def unknown_method(name: str) -> UnknownNameError:
     """Return the error for a name that no installed method has, with the nearest one."""
     installed = sorted(installed_methods())
-    module, _, attribute = name.rpartition(".")
-    hint = did_you_mean(name, installed)
-    if attribute == "py":
-        hint = f" Did you mean a class of this file, as {f'{module}:Class'!r}?"
-    elif module and not hint:
-        hint = f" Did you mean {f'{module}:{attribute}'!r}?"
+    if name in policy_names():
+        hint = f" It is a policy: give it as `--policy {name}`."
+    else:
+        hint = did_you_mean(name, installed) or class_hint(name)
     names = ", ".join(installed) or "none; run `pip install -e .` in the checkout"
     return UnknownNameError(f"No method is called {name!r}.{hint} Installed: {names}. Or give module:Class.")
 

@@ -6,10 +6,11 @@ A name is a built-in kind, such as "flow", with a size other than the smallest a
 
 from __future__ import annotations
 
-from clbench.base.entry_points import is_entry_point, unknown
-from clbench.base.errors import InputError, WrongTypeError
+from clbench.base.entry_points import class_hint, is_entry_point, unknown
+from clbench.base.errors import InputError, UnknownNameError, WrongTypeError
 from clbench.base.source import package_of, source_hash
-from clbench.spec.identifiers import LONGEST
+from clbench.base.text import did_you_mean
+from clbench.spec.fields import LONGEST
 
 POLICIES = {
     "flow": "flow matching: noise flows to a chunk of actions (pi0)",
@@ -71,7 +72,19 @@ def check_policy_name(name: str) -> None:
         raise WrongTypeError(f"A policy is given by a name, such as 'module:Class', not by {name!r}.")
     is_class = len(name) <= LONGEST and name.isascii() and is_entry_point(name)
     if name not in policy_names() and not is_class:
-        raise unknown("policy", name, [*policy_names(), "module:Class"])
+        raise _unknown_policy(name)
+
+
+def _unknown_policy(name: str) -> UnknownNameError:
+    """Return the error for a name that no policy has, with what was probably meant."""
+    known = policy_names()
+    if "://" in name:
+        hint = " `clbench score` plays a policy behind a server: docs/guide/external.md."
+    else:
+        hint = did_you_mean(name, known) or class_hint(name)
+    return UnknownNameError(
+        f"No policy is called {name!r}.{hint} Known: {', '.join(known)}, or module:Class."
+    )
 
 
 def policy_packages(policy: str) -> list[str]:

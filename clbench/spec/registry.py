@@ -7,10 +7,10 @@ import logging
 import gymnasium
 from gymnasium.envs import registration
 
-from clbench.base.entry_points import import_module, is_entry_point, resolve, unknown
+from clbench.base.entry_points import import_module, is_entry_point, resolve
 from clbench.base.errors import InputError, UnknownNameError
 from clbench.base.text import did_you_mean
-from clbench.spec.identifiers import check_scenario_id, scenario_ids
+from clbench.spec.identifiers import check_scenario_id, unknown_scenario
 from clbench.spec.scenario import Scenario
 
 LOG = logging.getLogger("clbench")
@@ -87,7 +87,7 @@ def registered_scenario(scenario_id: str) -> Scenario:
     if module:
         import_module(module, scenario_id)
     if name not in gymnasium.registry or "scenario" not in (gymnasium.registry[name].kwargs or {}):
-        raise unknown("scenario", name, scenario_ids())
+        raise unknown_scenario(scenario_id)
     entry_point = gymnasium.registry[name].kwargs["scenario"]
     scenario = _scenario_at(entry_point)
     if scenario.id != name:

@@ -65,6 +65,12 @@ def test_a_method_can_be_named_by_module_and_class(module: types.ModuleType) -> 
         ("no_such_module:Acme", LookupError, "No module 'no_such_module' can be imported"),
         ("stranger:Number", TypeError, "'stranger:Number' is not a subclass of clbench.Method"),
         ("stranger:Plain", TypeError, "'stranger:Plain' is not a dataclass"),
+        ("flow-base", LookupError, "It is a policy: give it as `--policy flow-base`"),
+        (
+            "clbench.policy.transformer:TransformerPolicy",
+            TypeError,
+            "is not a subclass of clbench.Method. It is a policy: give it as `--policy clbench.policy",
+        ),
     ],
 )
 @pytest.mark.usefixtures("module")

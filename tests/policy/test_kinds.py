@@ -21,6 +21,12 @@ class Listing(TransformerPolicy):
     abilities: ClassVar[Any] = ("answers",)
 
 
+class Misspelt(TransformerPolicy):
+    """Declares an ability that does not exist."""
+
+    abilities = frozenset({"hidden_state"})
+
+
 @pytest.mark.parametrize(
     ("kind", "needs", "error", "message"),
     [
@@ -31,6 +37,7 @@ class Listing(TransformerPolicy):
             "mine needs .* answers; .*:Mute lacks answers",
         ),
         (f"{__name__}:Listing", ("answers",), WrongTypeError, r"must be a set of texts, not \('answers',\)"),
+        (f"{__name__}:Misspelt", (), UnknownNameError, "'hidden_state'. Did you mean 'hidden_states'"),
         ("flow", ("answer",), UnknownNameError, "No ability of a policy .* 'answer'. Did you mean 'answers'"),
     ],
 )

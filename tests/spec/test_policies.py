@@ -48,6 +48,9 @@ def test_a_class_has_no_size_of_ours() -> None:
         ("module:", "No policy"),
         ("a" * 99 + ":B", "No policy"),
         ("mod ule:Class", "No policy"),
+        ("ws://localhost:8000", "`clbench score` plays a policy behind a server"),
+        ("mine.Mine", "Did you mean 'mine:Mine'"),
+        ("mine.py", "Did you mean a class of this file, as 'mine:Class'"),
     ],
 )
 def test_another_name_is_refused_with_the_nearest_one(name: str, hint: str) -> None:

@@ -84,6 +84,23 @@ def test_a_place_without_a_scenario_is_named_when_it_is_used(entry_point: str, m
         load_scenario("me/Other-v0")
 
 
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("lab/Two-v0", "name the module too, as 'module:lab/Two-v0'"),
+        ("strangers_module:lab/Two-v0", "'strangers_module' was imported, and does not register it"),
+        ("clbench/Fetch-v2", "Did you mean 'clbench/Fetch-v1'"),
+        ("Fetch", "Did you mean 'clbench/Fetch-v1'"),
+    ],
+)
+@pytest.mark.usefixtures("module")
+def test_an_id_that_nobody_registered_is_refused_with_what_was_probably_meant(
+    name: str, message: str
+) -> None:
+    with pytest.raises(LookupError, match=message):
+        load_scenario(name)
+
+
 def test_an_id_that_the_scenario_does_not_have_is_named() -> None:
     register("me/Other-v0", "strangers_module:MINE")
     with pytest.raises(LookupError, match="registered as 'me/Other-v0', but its id is 'me/Mine-v0'"):
