@@ -163,7 +163,8 @@ def _collect(name: str, scenario: Scenario, tasks: Sequence[Task], workers: int 
     from clbench.jobs.plan import Plan
 
     plan = Plan()
-    plan.add_demonstrations(name, scenario, tasks)
+    with checked_input():  # a recording may be missing
+        plan.add_demonstrations(name, scenario, tasks)
     _do(plan, workers)
 
 
@@ -238,7 +239,7 @@ def measure(scenario: ScenarioId, /, *tasks: str, episodes: Annotated[int, whole
 
     Args:
         scenario: Gymnasium id of the scenario.
-        tasks: Names of tasks (default: all tasks of the scenario).
+        tasks: Names of tasks (default: all tasks of the scenario that have an expert).
         episodes: Number of episodes of each task.
     """
     from clbench.data import expert_rates
@@ -250,10 +251,13 @@ def measure(scenario: ScenarioId, /, *tasks: str, episodes: Annotated[int, whole
     add_cwd_to_path()
     with checked_input():
         loaded = load_scenario(scenario)
-        chosen = [loaded.task(name) for name in tasks] or list(loaded.tasks)
-        for task in chosen:
+        named = [loaded.task(name) for name in tasks]
+        chosen = named or [task for task in loaded.tasks if recording_of(task) is None]
+        for task in named:
             if (recording := recording_of(task)) is not None:
                 raise InputError(f"{no_expert(task.name, recording)}.")
+        if not chosen:
+            raise InputError(f"No task of {loaded.id} has an expert: they learn from recordings.")
     with Bars(len(chosen) * episodes) as bars:
         bars.start(loaded.id, len(chosen) * episodes)
         with checked_input():  # an expert may refuse its task

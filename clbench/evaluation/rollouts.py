@@ -7,6 +7,7 @@ unused ones, because a matrix product may round differently for another number o
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
@@ -25,6 +26,8 @@ from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 from clbench.worlds.lanes import Lanes
 
+LOG = logging.getLogger(__name__)
+
 
 class Evaluator:
     """Runs episodes of a scenario; it makes each world on first use and keeps it.
@@ -40,6 +43,7 @@ class Evaluator:
         self.scenario = scenario
         self.seed = seed
         self._lanes = Lanes(lanes, threads)
+        self._warned = False
 
     def close(self) -> None:
         """Close all worlds."""
@@ -124,7 +128,10 @@ class Evaluator:
         chunks = policy.act(state.to(device), words.to(device), noise.to(device), image.to(device))
         _check_chunks(policy, chunks, rows)
         actions: NDArray[np.float32] = chunks[: len(live), : config.executed].cpu().numpy()
-        # a diverged policy returns NaN: with zero actions it fails and does not stop the run
+        if not (self._warned or np.isfinite(actions).all()):
+            self._warned = True
+            LOG.warning("%s: act() returned NaN or infinities, and NaN counts as 0.", type(policy).__name__)
+        # a diverged policy fails, and does not stop the run
         return np.nan_to_num(actions).clip(-1.0, 1.0)
 
 

@@ -6,7 +6,11 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from clbench.base.cache import is_cached
 from clbench.base.entry_points import resolve
+from clbench.base.errors import InputError
+from clbench.data.demonstrations import dataset_id, dataset_inputs
+from clbench.evaluation.definition import recording_of
 from clbench.jobs import work
 from clbench.jobs.job import Job, Product
 from clbench.jobs.recorded import has_failed, has_record
@@ -16,6 +20,7 @@ from clbench.records.paths import table_name
 from clbench.runs.length import point_length, run_length, training_length, watching_length
 from clbench.runs.spec import ResolvedRun
 from clbench.runs.start import is_evaluated, starts_as_pretrained
+from clbench.spec.budget import Budget
 from clbench.spec.identifiers import folder_name, without_module
 from clbench.spec.limits import Limits
 from clbench.spec.policies import DEFAULT_POLICY, kind_of
@@ -217,6 +222,7 @@ class Plan:
         """Return the job that collects the demonstrations of a task."""
         key = name, task.name
         if key not in self._data:
+            _check_recording(task, scenario.budget)
             title, arguments = (
                 _title(name, f"demonstrations {task.name}"),
                 {"scenario": name, "task": task.name},
@@ -235,6 +241,25 @@ def _check_entry_points(scenario: Scenario) -> None:
     for task in scenario.tasks + scenario.background + scenario.scenes:
         resolve(task.world)
         resolve(task.expert)
+
+
+def _check_recording(task: Task, budget: Budget) -> None:
+    """Refuse a task whose recorded demonstrations are not on this machine, before a policy is pretrained.
+
+    Raises:
+        InputError: They are missing: nothing but their file can bring them.
+    """
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    recording = recording_of(task)
+    if recording is None or is_cached(
+        get_dataset_path(dataset_id(task, budget)), dataset_inputs(task, budget)
+    ):
+        return
+    raise InputError(
+        f"The task {task.name} learns from the recording {recording}, and this machine has no such dataset "
+        "of this version of the task and of clbench: import it with `clbench demonstrations import`."
+    )
 
 
 def _record_of(run: ResolvedRun, records: Path) -> Product:

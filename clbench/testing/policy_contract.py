@@ -183,7 +183,10 @@ def losses(subject: Subject) -> None:
 def gradients(subject: Subject) -> None:
     """The mean of the losses has a finite gradient."""
     policy = subject.build()
-    torch.autograd.backward(policy.action_loss(subject.batch).mean())
+    loss = policy.action_loss(subject.batch).mean()
+    if not loss.requires_grad:
+        raise _breach(gradients, "losses with a gradient", "detached ones", "action_loss()")
+    torch.autograd.backward(loss)
     found = [parameter.grad for parameter in policy.parameters() if parameter.grad is not None]
     if not any(bool(gradient.abs().sum() > 0) for gradient in found):
         raise _breach(gradients, "a gradient in the parameters", "none that is not 0", "action_loss()")

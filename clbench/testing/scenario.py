@@ -195,7 +195,9 @@ def _play(task: Task, world: World, seed: int, act: Any) -> _Episode:
             break
         action = np.asarray(act(state), np.float32)
         if action.shape != world.action_space.shape or not np.isfinite(action).all():
-            raise ScenarioError(f"{where}: the action of {task.expert} must be in {world.action_space}.")
+            found = f"{action}, of shape {action.shape}"
+            place = f"{world.action_space}, without NaN"
+            raise ScenarioError(f"{where}: the action of {task.expert} must be in {place}, not {found}.")
         actions.append(action.clip(-1, 1))
         state, reward, done, truncated, info = world.step(actions[-1])
         if truncated:

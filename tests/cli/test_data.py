@@ -192,3 +192,7 @@ clbench.register("me/Shown-v0", "recorded_right:SCENARIO")
     assert " ".join(capsys.readouterr().err.split()) == (
         "error: The task right has no expert: it learns from the recording 0123456789abcdef."
     )
+    _clbench("experts", "measure", "recorded_right:me/Shown-v0", "--episodes", "2")
+    printed = capsys.readouterr().out
+    assert "left" in printed
+    assert "right" not in printed

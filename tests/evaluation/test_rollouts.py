@@ -158,12 +158,16 @@ def test_a_pretrained_toy_policy_masters_its_skills_and_not_the_targets() -> Non
     assert rates["right"] == rates["down"] == 0.0
 
 
-def test_a_policy_that_returns_nan_fails_its_episodes_and_stops_nothing(fetch_policy: Policy) -> None:
+def test_a_policy_that_returns_nan_fails_its_episodes_and_stops_nothing(
+    fetch_policy: Policy, caplog: pytest.LogCaptureFixture
+) -> None:
     broken = TransformerPolicy(fetch_policy.config)
     next(broken.head.parameters()).data.fill_(float("nan"))
     episodes = Evaluator(_with_episodes(validation_episodes=2), 0).evaluate(broken, [FETCH.task("press")])
     assert not any(episode.success for episode in episodes)
     assert {episode.length for episode in episodes} == {FETCH.task("press").horizon}
+    (warning,) = [entry.getMessage() for entry in caplog.records]
+    assert warning == "TransformerPolicy: act() returned NaN or infinities, and NaN counts as 0."
 
 
 def test_answers_are_counted_by_kind() -> None:

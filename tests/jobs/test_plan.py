@@ -10,7 +10,8 @@ import torch
 from eager import EAGER
 from tiny import TINY
 
-from clbench.base.errors import UnknownNameError
+from clbench.base.errors import InputError, UnknownNameError
+from clbench.exchange.recorded import expert_of
 from clbench.jobs.job import Job
 from clbench.jobs.plan import Plan
 from clbench.learning.method import Method
@@ -76,6 +77,16 @@ def test_a_missing_entry_point_of_any_task_is_refused_before_the_first_job(
     ):
         plan.add_run(dataclasses.replace(run, scenario=scenario), tmp_path)
     assert plan.jobs == []
+
+
+def test_a_missing_recording_is_refused_before_the_first_job(tmp_path: Path, empty_caches: Path) -> None:
+    run = RunSpec(TINY.id, "sft", 0).resolve()
+    recorded = dataclasses.replace(run.scenario.target[-1], expert=expert_of("0123456789abcdef"))
+    scenario = dataclasses.replace(run.scenario, target=(*run.scenario.target[:-1], recorded))
+    with pytest.raises(
+        InputError, match=f"{recorded.name} learns from the recording 0123456789abcdef, and this"
+    ):
+        Plan().add_run(dataclasses.replace(run, scenario=scenario), tmp_path)
 
 
 @pytest.mark.parametrize(

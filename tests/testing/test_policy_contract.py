@@ -145,6 +145,13 @@ class Detached(Base):
         return loss.detach() + 0 * loss
 
 
+class Cut(Base):
+    """Has a loss that no weight enters any more."""
+
+    def action_loss(self, batch: Batch, hidden: list[Tensor] | None = None) -> Tensor:
+        return super().action_loss(batch, hidden).detach()
+
+
 class Meddling(Base):
     """Changes the actions that it learns from; a second time they stay."""
 
@@ -324,6 +331,7 @@ BROKEN: list[tuple[type[Policy], str, str]] = [
     (Normalising, "losses", "alone"),
     (Padded, "losses", "does not depend on `valid`"),
     (Detached, "gradients", "none that is not 0"),
+    (Cut, "gradients", r"losses with a gradient\n  found:    detached ones"),
     (Restless, "actions", "draws from a global generator"),
     (Meddling, "losses", "it changed action in place"),
     (Shifting, "actions", "it changed state in place"),

@@ -152,6 +152,10 @@ def long(task: str) -> Callable[[Any], Any]:
     return lambda _: np.zeros(3, np.float32)
 
 
+def undefined(task: str) -> Callable[[Any], Any]:
+    return lambda _: np.full(2, np.nan, np.float32)
+
+
 def broken(task: str) -> Callable[[Any], Any]:
     return lambda _: 1 // 0
 
@@ -225,6 +229,7 @@ def test_a_faulty_world_is_named(world: str, message: str) -> None:
         ("careless", "task down: its expert .* succeeds in 0%"),
         ("broken", "task left: ZeroDivisionError: integer division or modulo by zero"),
         ("long", "the action of .*:long must be in Box"),
+        ("undefined", r"step 0: the action of .*:undefined must be .*, without NaN, not \[nan nan\]"),
     ],
 )
 def test_an_expert_that_cannot_do_its_task_is_named(expert: str, message: str) -> None:
