@@ -9,6 +9,7 @@ from __future__ import annotations
 import html
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import compress
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 from clbench.base.text import printable
@@ -348,6 +349,15 @@ class Record:
     def add_policy(self, row: PolicyRow) -> None:
         """Append a row to `policy`."""
         _append(self.policy, row)
+
+    def drop_stages(self, first: int) -> None:
+        """Remove the stages from `first` on, of a run whose stages other programs train one by one."""
+        for table in (self.episodes, self.answers):
+            stays = [stage < first for stage in table["stage"]]
+            for column in table.values():
+                column[:] = compress(column, stays)
+        self.diagnostics = {name: found for name, found in self.diagnostics.items() if int(name) < first}
+        del self.timing["stages"][first:]
 
 
 def _rows(row: Callable[..., Row], columns: dict[str, list[Any]]) -> list[Row]:

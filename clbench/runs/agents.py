@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from importlib.metadata import packages_distributions, version
-from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +32,7 @@ from clbench.evaluation.examiner import episode_row
 from clbench.evaluation.players import Agent, TrainingEnv, acts_on_batches, play, training_of
 from clbench.records.paths import RECORDS, record_path
 from clbench.records.pinned import other_parts, other_versions
-from clbench.records.reader import read_record
+from clbench.records.reader import RecordError, UnreadableRecordError, read_record
 from clbench.records.record import ONLINE_USES, AnswerRow, Record, RunInfo
 from clbench.records.writer import write_record
 from clbench.runs.fingerprint import fingerprint
@@ -218,7 +217,8 @@ class StagedRun:
         """Return the record so far, None if no stage has been evaluated.
 
         Args:
-            stale: Return also stages of another version of the scenario or its simulator.
+            stale: Return also stages of another version of the scenario or its simulator, and None for a
+                damaged file: the run starts over.
 
         Raises:
             InputError: The record is of another kind of run, or of another version and not finished.
@@ -228,7 +228,16 @@ class StagedRun:
         path = self.path if finished else self.unfinished
         if not path.exists():
             return None
-        record = read_record(path)
+        try:
+            record = read_record(path)
+        except RecordError as error:
+            if finished or isinstance(error, UnreadableRecordError):
+                raise
+            if not stale:
+                hint = "Evaluate all stages again (`clbench score` needs --restart), or remove the file."
+                raise RecordError(f"{error} {hint}") from error
+            LOG.warning("%s starts over: what it has so far is damaged. %s", self, error)
+            return None
         if record.run.uses != self.uses:
             raise InputError(
                 f"{path} was begun as another kind of run: evaluate all stages of agents that learn by trial "
@@ -344,7 +353,7 @@ class StagedRun:
             raise InputError(f"The settings of {self} are {settings}, but were {before} in stage 0.")
         if stage < following:
             LOG.warning("%s: its stages %d to %d are dropped.", self, stage, following - 1)
-            _drop(record, stage)
+            record.drop_stages(stage)
         return record
 
     def _new_record(self, settings: dict[str, Any], agent: Any) -> Record:
@@ -414,16 +423,6 @@ class StagedRun:
     def _release(self) -> None:
         if lease := _LEASES.pop(self.unfinished, None):
             lease.release()
-
-
-def _drop(record: Record, stage: int) -> None:
-    """Remove a stage and all later ones from a record."""
-    for table in (record.episodes, record.answers):
-        stays = [number < stage for number in table["stage"]]
-        for column in table.values():
-            column[:] = compress(column, stays)
-    record.diagnostics = {name: found for name, found in record.diagnostics.items() if int(name) < stage}
-    del record.timing["stages"][stage:]
 
 
 def _describe(agent: Any) -> dict[str, Any]:

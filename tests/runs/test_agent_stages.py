@@ -17,7 +17,7 @@ from clbench.base.errors import InputError
 from clbench.base.lease import LeaseLostError
 from clbench.cli.status import found_runs
 from clbench.evaluation.definition import definition
-from clbench.records.reader import read_record
+from clbench.records.reader import RecordError, read_record
 from clbench.records.record import Costs
 from clbench.runs.agents import next_stage
 from clbench.runs.spec import describe_scenario
@@ -109,6 +109,24 @@ def test_stages_of_another_scenario_or_simulator_are_refused_with_the_reason(
     with pytest.raises(InputError, match=message):
         evaluate(Knowing(), stage_env(1))
     evaluate(Knowing(), stage_env(0))
+    assert next_stage(ID, method="me/knows", records=tmp_path / "records") == 1
+
+
+def test_a_run_with_a_damaged_file_can_only_start_over(
+    evaluate: Callable[..., Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    evaluate(Knowing(), stage_env(0))
+    (path,) = (tmp_path / "records").rglob("*.unfinished")
+    path.write_bytes(path.read_bytes()[:100])
+    again = (
+        r"seed-0\.json\.unfinished: cannot be read as JSON .* Evaluate all stages again .* or remove the file"
+    )
+    with pytest.raises(RecordError, match=again):
+        next_stage(ID, method="me/knows", records=tmp_path / "records")
+    with pytest.raises(RecordError, match=again):
+        evaluate(Knowing(), stage_env(1))
+    evaluate(Knowing(), stage_env(0))
+    assert "starts over: what it has so far is damaged" in caplog.text
     assert next_stage(ID, method="me/knows", records=tmp_path / "records") == 1
 
 
