@@ -59,7 +59,7 @@ def show(
     charts as pictures; board.json. They always hold all scenarios.
 
     Args:
-        scenario: Show this scenario alone.
+        scenario: Show only this scenario.
         sort: Name or title of the metric that orders the rows of each division, for example kept.
         records: Folder of the records.
         published: First copy published records that the folder lacks, so that the table shows your rows
@@ -94,7 +94,7 @@ def show(
         board = computed = _computed(records)
     if not board.rows:
         _print_not_shown(board, messages)
-        messages.print(error_line(f"No record in {records} makes a row, and no board was written."))
+        messages.print(error_line(f"No record in {records} makes a row, so no board was written."))
         raise SystemExit(2)
     with checked_input():
         shown = _chosen(board, scenario, records)
@@ -243,8 +243,8 @@ def verify(
         scenario: module:id of the scenario, if clbench does not register it.
         checkpoints: Folder of policies from `clbench run --checkpoints` (default: train them again).
         pretrain: At the tier retrained, also repeat the pretraining (default: use the cached policy).
-        any_processor: Train again also on a processor that may compute otherwise than the record's. Equal
-            results prove the record; other results prove nothing.
+        any_processor: Also train again on a processor that may compute differently from the record's. Equal
+            results prove the record; different results prove nothing.
         by: Your name, for the file (default: none).
         workers: Number of verifications at once, each a process with one thread (default: all cores; for
             records of cuda, all GPUs).

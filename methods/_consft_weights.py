@@ -46,8 +46,8 @@ class WeightedSFT(Method, ABC):
     loss_scale: float = 1.0
     """Factor that converts the policy's loss to the unit for which the constants were published."""
     schedule: float = 1.0
-    """Length T of the schedule, as a share of the stage. Of a stage to a criterion it is a share of the steps
-    that plain fine-tuning with the same step factor takes to learn a target."""
+    """Length T of the schedule, as a share of the stage. For a stage that ends at a criterion, it is a share
+    of the steps that plain fine-tuning with the same step factor takes to learn a target."""
 
     metadata = Metadata(link="https://arxiv.org/abs/2605.08879")
     tunes = ("tau_start", (0.03, 0.3))

@@ -54,7 +54,7 @@ Details:
 `ConSFTCalibrated` multiplies the loss by `loss_scale` inside the weight, and keeps the other constants.
 Before the last tenth of the schedule, the published constants give only losses below 0.0024 a weight above
 0.01. The losses of this policy are larger, so nearly all weights stay at the floor until the schedule ends.
-How large the paper's losses are, we do not know. Multiplied by 0.003, a loss of 0.03 has a weight of 0.5 at
+We do not know how large the paper's losses are. Multiplied by 0.003, a loss of 0.03 has a weight of 0.5 at
 the start. The factor holds at the end temperature, too: 86 to 95 % of the weights are above 0.9 then, so that
 this arm does end as plain fine-tuning. Where methods are tuned, `clbench tune` chose `tau_start` of ConSFT
 and `loss_scale` of ConSFTCalibrated, each from three values; the records have the value.

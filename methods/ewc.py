@@ -18,8 +18,8 @@ Details:
 5. The gradient of the penalty is clipped together with the loss's, to a norm of 1, and goes through Adam: a
    strong penalty slows the target down, and `strength` does not mean what it does with plain gradient steps.
 6. The default of `strength` comes from validation episodes of the first Fetch board (docs/history.md). Where
-   methods are tuned, `clbench tune` chose again. Published values do not compare: the loss is a mean over the
-   numbers of a chunk, 32 on Fetch-v1, so the importance is about 1,000 times smaller than that of a sum.
+   methods are tuned, `clbench tune` chose again. Published values are not comparable: the loss is a mean over
+   the numbers of a chunk, 32 on Fetch-v1, so the importance is about 1,000 times smaller than that of a sum.
 7. The passes for the importance, 256 before the first target and after each, are no optimiser steps: no cost
    on the board counts them.
 """

@@ -89,7 +89,7 @@ def cache(
         f"Demonstrations: {minari_folder()} (MINARI_DATASETS_PATH moves it)",
     ]
     lines += [
-        f"{entry.path} is left: clbench did not make {_some(entry.foreign)} in it."
+        f"{entry.path} is not deleted: clbench did not make {_some(entry.foreign)} in it."
         for entry in found
         if entry.foreign
     ]

@@ -118,7 +118,7 @@ def metrics(
     markdown: Path | None = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show all metrics, everything about the metric NAME, or all metrics of your success rates in a CSV file.
+    """List all metrics, explain the metric NAME, or compute the metrics of success rates in a CSV file.
 
     A file has the column stage and one column for each task, or the columns stage, task and success. The
     columns method and seed are optional. robocasa365.csv is an example that comes with clbench.
@@ -128,7 +128,7 @@ def metrics(
         retained: Tasks of the file that are known before stage 1 and never trained again.
         target: Tasks of the file that are learned, in this order (default: all other tasks, as in the file).
         held_out: Tasks of the file that are never trained.
-        unit: Unit of the file's rates; without it, they are shares unless one is above 1.
+        unit: Unit of the rates in the file (default: percent if a rate is above 1, otherwise share).
         markdown: Write the page of all metrics to this file, for example docs/reference/metrics.md, and show
             nothing.
         as_json: Print a JSON list with an object for each metric, or one object for the file.

@@ -139,8 +139,8 @@ def import_(
 
     The file has the layout of robomimic and LIBERO: one group data/demo_i for each demonstration, with
     actions, states, rewards, dones and obs. It must fit the world, the horizon and the instructions of the
-    task, and have as many demonstrations as the budget. The task must name the demonstrations instead of
-    an expert. If it does not, the command checks the file and prints the name to write.
+    task, and have as many demonstrations as the budget requires. The task must name the demonstrations
+    instead of an expert. If it does not, the command checks the file and prints the name to write.
 
     Args:
         scenario: Gymnasium id of the scenario, as module:id.
@@ -186,17 +186,17 @@ def pretrain(
     workers: Annotated[int | None, whole_number(1)] = None,
     ship: bool = False,
 ) -> None:
-    """Pretrain the policy that every method starts from on SCENARIO, unless it is in the cache.
+    """Pretrain the policy from which every method on SCENARIO starts, unless it is in the cache.
 
     The command first collects missing demonstrations. `clbench run` does the same where a pretrained policy
     is missing.
 
     Args:
         scenario: Gymnasium id of the scenario.
-        policy: flow or discrete_diffusion, larger ones as flow-base (5 million parameters) or flow-large (40
-            million), or a class of your own as module:Class.
+        policy: flow or discrete_diffusion; a larger size, for example flow-base (5 million parameters) or
+            flow-large (40 million); or a class of your own, as module:Class.
         seed: Seed of the policy.
-        workers: Number of tasks to collect demonstrations of at once (default: all cores).
+        workers: Number of tasks whose demonstrations are collected at once (default: all cores).
         ship: Copy the policy to clbench/pretrained/, so that it ships with the package. Needs a checkout.
     """
     from clbench.jobs.bars import Bars
@@ -257,7 +257,7 @@ def measure(scenario: ScenarioId, /, *tasks: str, episodes: Annotated[int, whole
             if (recording := recording_of(task)) is not None:
                 raise InputError(f"{no_expert(task.name, recording)}.")
         if not chosen:
-            raise InputError(f"No task of {loaded.id} has an expert: they learn from recordings.")
+            raise InputError(f"No task of {loaded.id} has an expert: all of them use recordings.")
     with Bars(len(chosen) * episodes) as bars:
         bars.start(loaded.id, len(chosen) * episodes)
         with checked_input():  # an expert may refuse its task

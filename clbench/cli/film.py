@@ -63,8 +63,8 @@ def film(
         methods: Names of installed methods, or module:Class; at least one.
         seed: Seed of the run.
         tasks: Names of tasks, for example press,lift (default: all retained skills and targets).
-        stages: Numbers of stages, for example 0,4; all for one method, 0 and the last for several by
-            default. Stage 0 is before any target.
+        stages: Numbers of stages, for example 0,4 (default: all stages for one method, 0 and the last for
+            several). Stage 0 is before any target.
         episode: Number of the validation episode; test episodes are not filmed.
         output: A .gif or .mp4 file (default: a .gif below films/).
         size: Width of each picture in pixels.

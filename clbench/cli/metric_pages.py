@@ -44,7 +44,7 @@ def span(metric: Metric) -> str:
 
 def facts(metric: Metric) -> dict[str, str]:
     """Return the facts about a metric by title."""
-    seeds = "the geometric mean of their values" if metric.ratio else "the mean of their values"
+    seeds = "geometric mean over seeds" if metric.ratio else "mean over seeds"
     return {
         "Formula": metric.formula,
         "Source": metric.source,
@@ -53,7 +53,7 @@ def facts(metric: Metric) -> dict[str, str]:
         "Range": span(metric),
         "Units": metric.units,
         "Compared with": ", ".join(metric.references) or "nothing",
-        "Seeds": "averaged before it is computed" if metric.pooled else seeds,
+        "Seeds": "averaged over seeds first, then computed once" if metric.pooled else seeds,
         "None means": metric.missing,
     }
 

@@ -78,8 +78,8 @@ def run(
         order: Order of the targets, for scenarios with one published order: 0 is that order, other numbers
             are permutations. The leaderboard uses them to report how much scores depend on the order.
             Scenarios with a separate order for each seed, such as Fetch-v1, accept only 0.
-        policy: flow or discrete_diffusion, larger ones as flow-base (5 million parameters) or flow-large (40
-            million), or a class of your own as module:Class. Each policy has separate rows.
+        policy: flow or discrete_diffusion; a larger size, for example flow-base (5 million parameters) or
+            flow-large (40 million); or a class of your own, as module:Class. Each policy has separate rows.
         perturb: Also evaluate the skills and each new target in perturbed worlds: other start poses, heavier
             or lighter objects and, in pictures, another camera and light. Such a record replaces a record
             without perturbed episodes, as it holds the same episodes and more.
@@ -231,7 +231,7 @@ def _pictures(cameras: str | None, size: int | None) -> dict[str, Any]:
     """Return the options of `score` on pictures."""
     with checked_input():
         if cameras is None and size is not None:
-            raise InputError("--picture-size is the size of the pictures of --pictures: name cameras there.")
+            raise InputError("--picture-size needs --pictures: name the cameras there.")
         chosen = [] if cameras is None else items_of("--pictures", cameras)
     return {"pictures": chosen, **({} if size is None else {"picture_size": size})}
 

@@ -66,7 +66,7 @@ def new_policy(name: str, /, *, folder: Path = Path()) -> None:
 
 def _print_next(kind: str, files: tuple[Path, Path], folder: Path, command: str) -> None:
     module, test = files
-    lines = [f"Wrote {module} and {test}. Make the {kind} yours, then:"]
+    lines = [f"Wrote {module} and {test}. Edit the {kind}, then run:"]
     lines += [f"  cd {shlex.quote(str(folder))}"] if folder != Path() else []
     lines += [f"  python -m pytest {test.name}  # pip install pytest", f"  {command}"]
     print_plain(Console(), "\n".join(lines))

@@ -52,7 +52,7 @@ State = Literal["done", "running", "failed", "damaged", "unreadable", "to do"]
 
 STATES: tuple[State, ...] = get_args(State)
 
-OTHER_SETTINGS = "the record there has other settings, budget or code: `clbench run` does it again"
+OTHER_SETTINGS = "its record has different settings, budget or code: `clbench run` repeats the run"
 """Reason of a run that is to do although its place has a record."""
 
 
@@ -94,7 +94,7 @@ def status(
     changes: Annotated[dict[str, str] | None, Parameter(name="--set")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show which runs are done, running, failed and to do, and the time left.
+    """Show which runs are done, running, failed or still to do, and how much time is left.
 
     Without arguments the command shows every run in the folder of records. With the arguments of
     `clbench run` it shows those runs, including runs that no command has started. You can use it while other
@@ -107,8 +107,8 @@ def status(
         seeds: Number of seeds.
         first_seed: The first seed.
         order: Order of the targets, as for `clbench run`.
-        policy: flow or discrete_diffusion, larger ones as flow-base (5 million parameters) or flow-large (40
-            million), or a class of your own as module:Class.
+        policy: flow or discrete_diffusion; a larger size, for example flow-base (5 million parameters) or
+            flow-large (40 million); or a class of your own, as module:Class.
         records: Folder of the records.
         changes: Hyper-parameters that differ from those tuned for the scenario or, without tuning, from the
             method's defaults, as --set.name value.
@@ -234,7 +234,7 @@ def _line(state: RunState, records: Path) -> str | None:
     name = printable(state.path.relative_to(records).with_suffix("").as_posix())
     if state.owner is not None:
         if state.progress is None:
-            return f"{name}: begun by {state.owner}"
+            return f"{name}: started by {state.owner}"
         left = state.seconds_left
         rest = "" if left is None else f", about {clock_time(left)} left"
         spent = clock_time(state.progress.seconds)
@@ -252,7 +252,9 @@ def _summary(states: Sequence[RunState]) -> str:
     parts = [f"{counts[name]} {name}" for name in STATES if counts[name]]
     text = f"{counted(len(states), 'run')}: {', '.join(parts)}."
     left = seconds_left(states)
-    return text if left is None else f"{text} About {clock_time(left)} left with {counts['running']} at once."
+    if left is None:
+        return text
+    return f"{text} About {clock_time(left)} left with {counted(counts['running'], 'run')} at once."
 
 
 def _values(state: RunState, records: Path) -> dict[str, Any]:

@@ -60,14 +60,14 @@ def tune(
 ) -> None:
     """Choose the settings of METHODS for SCENARIO on validation episodes, with equal effort for each method.
 
-    Each method runs with four learning rates, then with two values of its own strength at the best of them,
-    or with two more learning rates. Runs learn all targets, with seeds that no board uses, and play no
-    test episodes. Of the settings whose success right after the stages (`learned`) is at
-    least 0.8, the one with the best final average wins. A
-    setting with a failed run, for example because the loss diverged, is not chosen.
-    Runs with a record are skipped: repeat a stopped command to continue it, or to see the choice again.
+    Each method first runs with four learning rates. At the best of these, it runs with two values of its own
+    strength; a method without a strength runs with two more learning rates instead. Runs learn all targets,
+    with seeds that no board uses, and never see test episodes. Of the settings whose success right after the
+    stages (`learned`) is at least 0.8, the one with the best final average wins. A setting with a failed
+    run, for example because the loss diverged, is not chosen. Runs with a record are skipped: repeat a
+    stopped command to continue it, or to see the choice again.
 
-    With --values the methods run with every combination of these values instead, besides plain fine-tuning,
+    With --values, plain fine-tuning and the methods run, the methods with every combination of these values,
     and nothing is chosen.
 
     Args:
@@ -84,8 +84,8 @@ def tune(
         workers: Number of runs at once, each a process with one thread (default: all cores; with --device
             cuda, all GPUs).
         device: Device that runs the policies, for example cpu or cuda, which gives each run one of the GPUs.
-        policy: flow or discrete_diffusion, larger ones as flow-base (5 million parameters) or flow-large (40
-            million), or a class of your own as module:Class.
+        policy: flow or discrete_diffusion; a larger size, for example flow-base (5 million parameters) or
+            flow-large (40 million); or a class of your own, as module:Class.
         records: Folder of the records.
         write: File for the chosen settings; it keeps the settings of other methods. For built-in methods,
             `clbench run` reads methods/tuned/. Cannot be used with --values.

@@ -52,7 +52,7 @@ def _facts(matrices: Matrices) -> Iterator[Text]:
         if tasks:
             yield Text(f"{title}: {printable(', '.join(tasks))}.")
     if _most_seeds(matrices) > 1:
-        yield Text(f"Seeds: {_seeds(matrices)}; the mean of their values, and its 95 % interval.")
+        yield Text(f"Seeds: {_seeds(matrices)}. Values are means over seeds, with 95 % intervals.")
 
 
 def _most_seeds(matrices: Matrices) -> int:

@@ -63,5 +63,6 @@ def expected_precision(scenario: Scenario, seeds: int) -> str:
     counts = {"retention": retained, "adaptation": target, "final average": retained + target}
     widths = {name: half_width(seeds, episodes, tasks) for name, tasks in counts.items() if tasks}
     parts = ", ".join(f"± {width:.2f} for {name}" for name, width in widths.items())
-    what, of = (f"{seeds} seeds", "95 %") if seeds > 1 else ("1 seed", "95 %, of this seed alone")
-    return f"{what} x {episodes} episodes: near a rate of one half expect about {parts} ({of})."
+    what, end = (f"{seeds} seeds", "") if seeds > 1 else ("1 seed", ", for this seed alone")
+    expected = f"expect 95 % intervals of about {parts}, at rates near one half{end}"
+    return f"{what} x {episodes} episodes: {expected}."

@@ -146,7 +146,7 @@ def _where(chosen: Array, values: Array) -> Array:
 
 
 @metric(
-    formula="final_average less the final_average of sft with the same seed",
+    formula="final_average minus the final_average of sft with the same seed",
     source="clbench",
     low=-1.0,
     units=DIFFERENCE,
@@ -161,7 +161,7 @@ def gain(rates: Rates) -> Array:
 
 @metric(
     formula="mean over the targets of the optimiser steps until the criterion was met; a stage that never "
-    "met it counts with all steps of the budget",
+    "met it counts as the full budget of steps",
     source="clbench",
     high=math.inf,
     higher_is_better=False,
@@ -199,8 +199,8 @@ def criterion_met(rates: Rates) -> Array:
 def speed(rates: Rates) -> Array:
     """Speed of learning the targets, relative to learning from scratch.
 
-    A stage that never meets its criterion counts with all steps of the budget. The value is too low where
-    that is a stage of from_scratch, and too high where it is one of the method.
+    A stage that never meets its criterion counts as the full budget of steps. If from_scratch has such a
+    stage, the value is too low; if the method has one, it is too high.
     """
     ratios = np.maximum(rates.references[FROM_SCRATCH].steps, 1.0) / np.maximum(rates.steps, 1.0)
     return np.where(average(rates.met) > 0, np.exp(average(np.log(ratios))), np.nan)
@@ -214,8 +214,8 @@ def speed(rates: Rates) -> Array:
 def perturbed_retention(rates: Rates) -> Array:
     """Success on the retained skills after the last target, with perturbed start poses, masses and views.
 
-    The episodes are the same as for `retention`, number by number: the difference is the loss by
-    perturbation. The success of the pretrained policy shows how much of that loss was there before any
+    The episodes are the same as for `retention`, number by number: the difference is the loss caused by
+    the perturbation. The success of the pretrained policy shows how much of that loss was there before any
     target.
     """
     return average(rates.perturbed[..., -1, rates.layout.columns("retained")])
@@ -248,8 +248,8 @@ def perturbed_adaptation(rates: Rates) -> Array:
 def forgetting(rates: Rates) -> Array:
     """Drop from the best success before the last stage to the success after it.
 
-    The highest of several noisy rates is too high by a part of their noise, so that a policy that does not
-    change at all has a small positive value with few episodes. `backward_transfer` has no such bias.
+    The highest of several noisy rates is biased upwards, so with few episodes even a policy that never
+    changes has a small positive value. `backward_transfer` has no such bias.
     """
     # The last target has no stage between learning it and the end.
     known = np.concatenate([rates.retained, rates.target[..., :-1]], axis=-1)
@@ -269,7 +269,7 @@ def forgetting(rates: Rates) -> Array:
     missing="There are fewer than two targets, or a success on an earlier one is missing.",
 )
 def backward_transfer(rates: Rates) -> Array:
-    """Change of the success on earlier targets by learning the later ones."""
+    """Change in success on the earlier targets from learning the later ones."""
     return average(rates.target[..., -1, :-1] - rates.learned[..., :-1])
 
 
@@ -351,7 +351,7 @@ def update_sparsity(rates: Rates) -> Array:
 @metric(
     formula="squared 2-Wasserstein distance between the hidden states of the policy and of the pretrained "
     "policy on the test questions, mean over layers, at the end of stage K",
-    source="AEGIS, arXiv 2604.16067; its penalty is of the training batch, this is of questions",
+    source="AEGIS, arXiv 2604.16067; its penalty is computed on the training batch, this metric on questions",
     high=math.inf,
     higher_is_better=False,
     units="squared distance",
@@ -383,10 +383,10 @@ def shift(rates: Rates) -> Array:
     "which target k is done although the instruction asks for a retained skill, the skills in turn",
     source="clbench",
     higher_is_better=False,
-    missing="The scenario has no criterion or retains no skill, or the record is older than this.",
+    missing="The scenario has no criterion or retains no skill, or the record is older than this metric.",
 )
 def instruction_capture(rates: Rates) -> Array:
-    """Share of episodes in which the policy does the latest target, although a skill is asked for."""
+    """Share of episodes in which the policy does the latest target although it was asked for a skill."""
     return average(rates.captured)
 
 

@@ -85,7 +85,7 @@ def average_incremental_accuracy(rates: Rates) -> Array:
     higher_is_better=False,
 )
 def forgetting_chaudhry(rates: Rates) -> Array:
-    """Drop from the best success on a target at any earlier stage, stages before it was learned included."""
+    """Drop from the best success on a target at any earlier stage, even before it was learned."""
     matrix = _matrix(rates)
     if matrix.shape[-1] < 2:
         return np.full(matrix.shape[:-2], np.nan)
@@ -101,7 +101,7 @@ def forgetting_chaudhry(rates: Rates) -> Array:
     higher_is_better=False,
 )
 def forgetting_mammoth(rates: Rates) -> Array:
-    """Drop from the best success on a target since it was learned, the last one included: never below 0."""
+    """Drop from the best success on a target since it was learned, the end included: never below 0."""
     matrix = _matrix(rates)
     if matrix.shape[-1] < 2:
         return np.full(matrix.shape[:-2], np.nan)
@@ -131,7 +131,7 @@ def forgetting_avalanche(rates: Rates) -> Array:
     higher_is_better=False,
 )
 def forgetting_continual_world(rates: Rates) -> Array:
-    """Drop from the success right after a target was learned; the last target's, always 0, counts too."""
+    """Drop from the success right after a target was learned; the last target counts, too, always with 0."""
     if len(rates.layout.target) < 2:
         return average(rates.learned[..., :0])
     return average(_drops(rates)[..., -1, :])
@@ -174,7 +174,7 @@ def _backward_transfer(rates: Rates) -> Array:
     units=DIFFERENCE,
 )
 def backward_transfer_diaz_rodriguez(rates: Rates) -> Array:
-    """Change of the success on earlier targets, over all later stages and not the last alone."""
+    """Change in success on the earlier targets, over all later stages and not only the last one."""
     return _backward_transfer(rates)
 
 
@@ -318,7 +318,7 @@ def _own_curves(rates: Rates) -> Array:
     higher_is_better=False,
 )
 def negative_backward_transfer_libero(rates: Rates) -> Array:
-    """Drop of the success on earlier targets over all later stages; the last target counts as 0."""
+    """Drop in success on the earlier targets over all later stages; the last target counts as 0."""
     return _weighted(_drops(rates), _over_later(rates) / max(len(rates.layout.target), 1))
 
 
@@ -331,7 +331,7 @@ def negative_backward_transfer_libero(rates: Rates) -> Array:
     higher_is_better=False,
 )
 def negative_backward_transfer_clare(rates: Rates) -> Array:
-    """Drop of the success on earlier targets over all later stages; the last target does not count."""
+    """Drop in success on the earlier targets over all later stages; the last target does not count."""
     return _weighted(_drops(rates), _over_later(rates) / max(len(rates.layout.target) - 1, 1))
 
 
@@ -349,7 +349,7 @@ def _over_later(rates: Rates) -> Array:
     higher_is_better=False,
 )
 def negative_backward_transfer_arfm(rates: Rates) -> Array:
-    """Drop of the success on earlier targets after the last one; a gain counts as 0."""
+    """Drop in success on the earlier targets after the last one; a gain counts as 0."""
     if len(rates.layout.target) < 2:
         return average(rates.learned[..., :0])
     return average(np.maximum(_drops(rates)[..., -1, :-1], 0))
@@ -382,7 +382,7 @@ def area_under_curve_libero(rates: Rates) -> Array:
     units=DIFFERENCE,
 )
 def zero_shot_change(rates: Rates) -> Array:
-    """Change of the success on tasks that were never trained, from the pretrained policy to the end."""
+    """Change in success on tasks that were never trained, from the pretrained policy to the end."""
     change = rates.held_out[..., -1, :] - rates.held_out[..., 0, :]
     return average(change if rates.layout.target else change[..., :0])
 

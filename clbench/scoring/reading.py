@@ -110,7 +110,7 @@ def _read_ends(record: Record) -> tuple[int, ...]:
 def read_checks(record: Record, protocol: Protocol) -> tuple[Array, Array]:
     """Return the steps to the criterion of each stage, and whether it was met, (targets,); NaN without one.
 
-    A stage that never met it counts with all steps of the budget, also that of a method that trains nothing
+    A stage that never met it counts as the full budget of steps, also that of a method that trains nothing
     and is checked once.
     """
     ends = dict.fromkeys(protocol.stages[1:], (math.nan, math.nan))

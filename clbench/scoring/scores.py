@@ -32,7 +32,7 @@ WEAK = 0.8
 """Success of the pretrained policy on the retained skills below which there is little to forget."""
 
 WEAK_WARNING = (
-    "That is little: what it never could do cannot be forgotten, and low retention need not mean forgetting."
+    "That is low: a policy cannot forget what it never could do, so low retention need not mean forgetting."
 )
 
 

@@ -31,10 +31,10 @@ class Budget:
     pretraining_learning_rate: float = 1.5e-3
     """Peak learning rate of pretraining."""
     adaptation_steps: int = 300
-    """Optimiser steps on each target task; with a criterion the most."""
+    """Optimiser steps on each target; with a criterion, the maximum."""
     criterion: float | None = None
-    """Success rate on the target's validation episodes that ends a stage; without it, stages are equally
-    long."""
+    """Success rate on the target's validation episodes that ends a stage; without a criterion, all stages
+    are equally long."""
     learning_rate: float = 3e-4
     """Peak learning rate of adaptation, which each method multiplies by its `step_factor`."""
     batch_size: int = 64
@@ -44,13 +44,13 @@ class Budget:
     policy_layers: int = 3
     """Layers of the policy's backbone, and as many of its action head."""
     evaluation_points: int = 4
-    """Evaluation points of each stage, its end included. A stage with a criterion has its end alone."""
+    """Number of evaluation points of each stage, including its end; with a criterion, only its end."""
     validation_episodes: int = 10
-    """Validation episodes per task, which choices may look at."""
+    """Validation episodes per task; they may guide choices."""
     test_episodes: int = 20
-    """Test episodes per task, which only scores are computed from."""
+    """Test episodes per task; they give scores and never guide choices."""
     curve_episodes: int = 5
-    """Test episodes per task at the points before the end of a stage: the first ones."""
+    """Number of test episodes per task, counted from the first, at the points before the end of a stage."""
 
     def __post_init__(self) -> None:
         check_whole(self, 1, "demonstrations", "question_episodes", "test_questions")

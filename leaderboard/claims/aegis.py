@@ -75,7 +75,7 @@ def action_loss_erodes_answers(evidence: Evidence) -> Finding:
     half = [one for step, one in zip(steps, curve, strict=True) if step <= steps[-1] / 2]
     sentences = _when_lost(evidence, "sft")
     if evidence.difference("question_retention", "stop_gradient", "sft").low > 0:
-        sentences.append("Without that gradient in the backbone less is lost: the gradient is the cause.")
+        sentences.append("Without this gradient in the backbone, less is lost, so the gradient is the cause.")
     verdict = decided(
         holds=any(figure.low > 0.01 for figure in half),
         in_part=drop.low > 0.01,
@@ -334,10 +334,10 @@ def _where_it_begins(first: Figure, last: Figure) -> tuple[str, ...]:
     if not last.high < first.low:
         return ()
     return (
-        "The robot's batches are no questions, so that their distance to the anchor is "
-        f"{first.value:.1f} before the first step. It ends at {last.value:.1f}. The projection removes only "
-        "what leads away: it does not hold the robot's hidden states in place, and they move onto those of "
-        "the questions.",
+        "The robot's batches are not questions, so their distance to the anchor is "
+        f"{first.value:.1f} even before the first step. It ends at {last.value:.1f}. The projection removes "
+        "only what leads away from the anchor: it does not hold the robot's hidden states in place, and they "
+        "move onto those of the questions.",
     )
 
 

@@ -44,7 +44,8 @@ def inactive_sentences(evidence: Evidence) -> tuple[str, ...]:
     shares = ((arm, share_between(evidence, arm)) for arm in ARMS)
     return tuple(
         f"Before the last tenth of its schedule, {share.value:.1%} of the weights of {arm} lie between 0.01 "
-        f"and 0.9: most samples weigh alike, and its figures do not count.{_afterwards(evidence, arm)}"
+        "and 0.9: most samples have nearly the same weight, so its figures do not "
+        f"count.{_afterwards(evidence, arm)}"
         for arm, share in shares
         if not _counts(share)
     )
@@ -62,8 +63,8 @@ def _afterwards(evidence: Evidence, arm: str) -> str:
         return ""
     between = share_between(evidence, arm, afterwards=True)
     return (
-        f" This leaves out the last tenth and what follows: {later.value:.0%} of its weights, of which "
-        f"{between.value:.0%} lie between."
+        f" This leaves out the last tenth and what follows, which have {later.value:.0%} of its weights; "
+        f"{between.value:.0%} of these lie between 0.01 and 0.9."
     )
 
 
@@ -81,7 +82,10 @@ def change_of_arms(verdict: Verdict, counting: Sequence[Figure], every: Sequence
     if (figure := next(may_rise, None)) is not None:
         return what_would_change(figure, bar)
     above = next(figure for figure in every if not figure.high < bar)  # it keeps the claim from failing
-    return f'An interval of "{above.what}" below {bar:{above.form}}: its arm does not count.'
+    return (
+        f'An interval of "{above.what}" that lies below {bar:{above.form}}: its arm does not count, but it '
+        "keeps the claim from failing."
+    )
 
 
 def if_all_counted(arms: Sequence[str], verdict: Verdict, of_all: Verdict) -> tuple[str, ...]:
@@ -97,7 +101,7 @@ def if_all_counted(arms: Sequence[str], verdict: Verdict, of_all: Verdict) -> tu
         return ()
     if of_all == verdict:
         return (f"If {others} counted, the verdict would be the same.",)
-    return (f'If {others} counted: "{of_all}".',)
+    return (f'If {others} counted, the verdict would be "{of_all}".',)
 
 
 def without_an_arm(

@@ -178,7 +178,7 @@ def what_would_change(figure: Figure, bar: float) -> str:
         return f"A narrower {interval}: it contains {bar:{form}}."
     needed = _seeds_for(gap, half, len(figure.seeds))
     how_many = f"about {needed}" if needed else f"more than {MOST_SEEDS}"
-    return f"At this spread {how_many} seeds: the {interval} contains {bar:{form}}."
+    return f"At this spread, {how_many} seeds would be needed: the {interval} contains {bar:{form}}."
 
 
 def deciding(verdict: Verdict, figures: Sequence[Figure], bar: float) -> Figure:

@@ -66,7 +66,7 @@ WITH_LIBERO = (*BOARDS, "clbench/LiberoSpatial-v1")
     scenarios=WITH_LIBERO,
 )
 def sft_degrades(evidence: Evidence) -> Finding:
-    """Fine-tuning without constraint degrades pretrained skills."""
+    """Unconstrained fine-tuning degrades pretrained skills."""
     drop, published = (retention_drop(evidence, label) for label in ("sft", rung("sft", PUBLISHED)))
     joint = kept(evidence, "joint", rung("sft", PUBLISHED))  # joint has the scenario's learning rate
     learned = evidence.metric("adaptation", "joint")
@@ -87,7 +87,7 @@ def _what_joint_says(gain: Figure, learned: Figure) -> tuple[str, ...]:
     if gain.low > 0:
         return (
             f"joint, which trains on all data and learns {learned.value:.2f} of the targets, keeps more than "
-            "sft at the same learning rate: learning alone need not degrade.",
+            "sft at the same learning rate: learning alone need not degrade skills.",
         )
     less = "keeps even less than" if gain.high < 0 else "is not told apart from"
     return (

@@ -130,7 +130,7 @@ def auxiliary_objective_helps(evidence: Evidence) -> Finding:
     margin="5 % of the steps",
 )
 def vector_carries_the_capability(evidence: Evidence) -> Finding:
-    """The difference of two trainings on a few tasks is a vector; merged, it replaces the objective."""
+    """The difference between two trainings on a few tasks is a vector; merged, it replaces the objective."""
     over_sft, over_random = _of_the_vector(evidence)
     over_objective = share_of_steps(evidence, VECTOR, CO_TRAINING)
     controls = (over_random, over_objective, share_of_steps(evidence, CO_TRAINING, SFT))
@@ -284,10 +284,10 @@ PEER = (
     "observation is not in this figure."
 )
 
-AS_GOOD = "One forward certainly succeeds at most 0.03 less often than 12: there is nothing to speed up."
-AS_LONG = "A forward takes as long for all tokens as for a block: only fewer forwards save time here."
-HARDER = "Tasks in which actions that are decoded in one forward fail."
-WIDER = "A policy that is wide enough for the time of a forward to follow its tokens."
+AS_GOOD = "One forward pass certainly succeeds at most 0.03 less often than 12: there is nothing to speed up."
+AS_LONG = "A forward pass takes as long for all tokens as for a block: only fewer passes save time here."
+HARDER = "Tasks on which decoding in one forward pass fails."
+WIDER = "A policy that is wide enough for the time of a forward pass to grow with its tokens."
 
 
 def _counts(found: Decoding) -> tuple[Figure, ...]:

@@ -86,7 +86,7 @@ def _definitions(boards: Mapping[str, list[Row]]) -> Iterator[str]:
     for name, taus in found.items():
         if taus:
             listed = ", ".join(f"{title_of(metric)} {tau:.2f}" for metric, tau in taus.items())
-            yield f"On {name}, Kendall's tau between the final average and other definitions is: {listed}."
+            yield f"On {name}, Kendall's tau between the final average and other metrics is: {listed}."
     if any(found.values()):
         yield (
             "All definitions count the same episodes, so they would order even equal methods alike: "
@@ -133,9 +133,9 @@ def _shares_of_variance(name: str, rows: Sequence[Row]) -> Iterator[str]:
         for squares, degrees in ((by_method, methods - 1), (by_seed, seeds - 1))
     )
     yield (
-        f"On {name}, of the variance of the final average over {methods} methods without prior "
-        f"demonstrations and {seeds} seeds, the method explains {of_methods:.0%}, and the seed "
-        f"with its order of the targets {of_seeds:.0%} (omega squared)."
+        f"On {name}, the method explains {of_methods:.0%} of the variance of the final average, and the seed "
+        f"with its order of the targets {of_seeds:.0%} (omega squared; {methods} methods without prior "
+        f"demonstrations, {seeds} seeds)."
     )
 
 
@@ -181,5 +181,5 @@ def _order(found: Agreement, methods: str, corrected: float) -> str:
         0: f"show no certain agreement on the order of {methods}",
         -1: f"put {methods} in opposite orders",
     }
-    alone = ", by this p alone" if found.direction and corrected >= SIGNIFICANCE else ""
+    alone = ", but only before Holm's correction" if found.direction and corrected >= SIGNIFICANCE else ""
     return f"{words[found.direction]}{alone} (Kendall's tau {tau_text(found)})"

@@ -77,7 +77,7 @@ def sections(board: Board, judged: Sequence[Judged], evidence: Callable[[str], E
         _gains(boards, board.tied),
         _replay(boards, board.tied),
         _learning_rates(board, evidence),
-        Section("Is a lost skill gone?", tuple(relearning_sentences(boards))),
+        Section("Is a lost skill gone for good?", tuple(relearning_sentences(boards))),
         _claims(judged),
         Section(
             "Do seeds, scenarios and definitions order the methods alike?",
@@ -163,7 +163,7 @@ def _replay(boards: dict[str, list[Row]], tied: Tied) -> Section:
                 continue
             gain = row.estimates["gain"]
             moves = "gains" if sides.get(row.method) == 1 else "changes the final average by"
-            doubt = "" if row.method in sides else ", which is not certain"
+            doubt = "" if row.method in sides else " (not certain)"
             answers.append(
                 f"On {name}, `{row.method}` {moves} {format_interval(gain)}{doubt}, keeps "
                 f"{megabytes(int(kept))} between stages, and takes {_steps(row)} steps to learn a "
@@ -180,9 +180,9 @@ WHAT_IS_KEPT = (
 )
 
 OWN_RATES = (
-    "Each method has the learning rate that tuning chose for it, and a smaller one takes more steps: a "
-    "difference in steps need not come from the demonstrations. A stage that misses the criterion counts "
-    "with all steps of the budget."
+    "Each method has the learning rate that tuning chose for it. A smaller rate takes more steps, so a "
+    "difference in steps need not come from the demonstrations. A stage that misses the criterion counts as "
+    "the full budget of steps."
 )
 
 
@@ -197,11 +197,11 @@ def _steps(row: Row) -> str:
 
 
 def _learning_rates(board: Board, evidence: Callable[[str], Evidence]) -> Section:
-    """How much a smaller learning rate does alone."""
+    """How much a smaller learning rate achieves on its own."""
     head = ("scenario", "method", "factor", "learned", "kept", "seeds")
     answers = tuple(rate_sentences(board.frontiers, _usual(board), evidence))
     lines = tuple(rate_lines(board.frontiers))
-    return Section("How much does a smaller learning rate do alone?", answers, head, lines)
+    return Section("How much does a smaller learning rate achieve on its own?", answers, head, lines)
 
 
 def _claims(judged: Sequence[Judged]) -> Section:
@@ -216,12 +216,12 @@ def _claims(judged: Sequence[Judged]) -> Section:
     boards = tuple(dict.fromkeys(one.evidence.scenario for one in judged))
     found = grouped((one.claim, one) for one in judged)
     lines = tuple(_claim_line(claim, members, boards) for claim, members in found.items())
-    head = ("id", "claim", "first figure", *boards)
+    head = ("id", "claim", "measured quantity", *boards)
     answers += [*_explanations(judged), *_what_would_show_it(judged)]
     if lines:
         answers.append(
-            "The table has the value of the first figure after each verdict. The page of the claims has the "
-            "rules, the other figures and the controls."
+            "After each verdict, the table gives the value of this quantity. The page of the claims has the "
+            "rules, all other figures and the controls."
         )
     return Section("Which claims of the papers hold here?", tuple(answers), head, lines)
 
@@ -276,7 +276,10 @@ def _what_would_show_it(judged: Sequence[Judged]) -> list[str]:
     ]
 
 
-MADE_FOR_IT = "the one scenario that was made to show it, by training far past learning and in large steps"
+MADE_FOR_IT = (
+    "the one scenario that was made to show it, with large steps and training that goes on long after the "
+    "target is learned"
+)
 
 
 def _those_that_hold(judged: Sequence[Judged]) -> str:
@@ -310,7 +313,7 @@ def _predictors(boards: dict[str, list[Row]]) -> Section:
     words = {
         1: "orders the methods as forgetting does, more than chance would explain",
         0: "shows no certain agreement with forgetting on the order of the methods",
-        -1: "orders the methods against their forgetting",
+        -1: "orders the methods opposite to their forgetting",
     }
     found = [
         (name, which, one)
@@ -324,16 +327,15 @@ def _predictors(boards: dict[str, list[Row]]) -> Section:
     if answers:
         answers.insert(
             0,
-            "Forgetting is here 1 minus the kept share. Both quantities come from the same runs, so p is the "
-            "share of simulated boards of equal methods, with the noise of these runs, that have such a tau. "
-            "Methods differ in more than one way, such as their learning rate: an order that agrees does not "
-            "say what causes forgetting.",
+            "Here, forgetting is 1 minus the kept share. Both quantities come from the same runs, so p is "
+            "simulated: it is the share of simulated boards with equal methods, and with the noise of these "
+            "runs, that have such a tau. Methods differ in more than one way, for example in learning rate, "
+            "so an order that agrees does not show what causes forgetting.",
         )
         answers += after_correction([one.chance for _, _, one in found])
         if any(row.method == "stop_gradient" for rows in boards.values() for row in rows):
             answers.append(
-                "`stop_gradient` leaves the backbone as it is, so that few of its weights change by "
-                "construction."
+                "`stop_gradient` does not train the backbone, so by construction few of its weights change."
             )
     return Section("What predicts how much a method forgets?", tuple(answers))
 
@@ -356,12 +358,14 @@ def _knowledge(boards: dict[str, list[Row]]) -> Section:
                 f"{format_interval(after['retention'])}, and "
             )
         answers.append(
-            f"On {name}, where stages {stages}, {skills}the share of right answers goes from "
+            f"On {name}, where stages {stages}, {skills}the share of correct answers goes from "
             f"{format_interval(before['question_retention'])} to "
             f"{format_interval(after['question_retention'])}."
         )
     if answers:
-        answers.insert(0, "Plain fine-tuning, before the first target and after the last one:")
+        answers.insert(
+            0, "All figures are for plain fine-tuning, before the first target and after the last one."
+        )
     return Section("Are skills and knowledge lost together?", tuple(answers))
 
 
@@ -382,21 +386,22 @@ def _policies(board: Board) -> Section:
             lower = sum(one.is_below(0) for one in apart)
             higher = sum(one.is_above(0) for one in apart)
             answers.append(
-                f"On {scenario} with {policy}, the kept share of {lower} of "
-                f"{counted(len(apart), 'method')} is lower than with the flow policy, and that of {higher} "
-                "higher, by intervals of their own, without correction for "
-                f"{counted(len(apart), 'comparison')}. Its methods have the settings that were tuned for the "
-                "flow policy, and its stages take other numbers of steps: tuning may explain a difference. "
-                "So may learning: what was never learned cannot be forgotten."
+                f"On {scenario} with {policy}, {lower} of {counted(len(apart), 'method')} "
+                f"{'has' if lower == 1 else 'have'} a lower kept share than with the flow policy, and "
+                f"{higher} {'has' if higher == 1 else 'have'} a higher one. Each method is judged by its own "
+                f"interval, without correction for {counted(len(apart), 'comparison')}. The methods have the "
+                "settings that were tuned for the flow policy, and their stages take different numbers of "
+                "steps, so tuning may explain a difference. So may learning: what was never learned cannot "
+                "be forgotten."
             )
         elif comparisons:
             answers.append(
-                f"On {scenario} with {policy} there is one seed, which tells nothing for certain: the table "
-                "has no interval of it."
+                f"On {scenario} with {policy}, there is only one seed, which shows nothing for certain, so "
+                "the table gives no interval."
             )
     head = (
-        *("scenario", "method", "other policy", "kept share, flow", "kept share, the other", "difference"),
-        *("learned, flow", "learned, the other", "seeds"),
+        *("scenario", "method", "other policy", "kept share, flow", "kept share, other policy", "difference"),
+        *("learned, flow", "learned, other policy", "seeds"),
     )
     return Section("Does forgetting depend on the policy?", tuple(answers), head, tuple(lines))
 

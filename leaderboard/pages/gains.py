@@ -71,32 +71,33 @@ def gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[T
         yield from over_tied(name, f"`{method}`", gains[method], tied.get(method, ()))
     if not better:
         best = next(iter(gains))
-        which = f"the gain of `{best}`"
+        which = f"the gain of `{best}` is"
         if len(gains) > 1:
-            which = f"the largest gain of {len(gains)} methods, that of `{best}`,"
+            which = f"the largest gain of {len(gains)} methods is that of `{best}`,"
         yield (
-            f"On {name}, none is told apart from plain fine-tuning as better: {which} is "
+            f"On {name}, no method is above plain fine-tuning and told apart from it: {which} "
             f"{format_interval(gains[best], '.3f')}. {_power(rows, gains)}"
         )
-    alone = "by its own interval alone"
+    alone = "by its own interval only"
     if len(gains) > 1:
-        alone += f", without correction for {len(gains)} comparisons"
+        alone += f" (not corrected for {len(gains)} comparisons)"
     higher = {method: gain for method, gain in gains.items() if gain.is_above(0) and method not in better}
     over_both = {
         method: gain for method, gain in higher.items() if side_of_zero(gain, tied.get(method, ())) == 1
     }
     if over_both:
-        yield f"Higher {alone}: {_listed(over_both)}."
+        yield f"On {name}, above plain fine-tuning {alone}: {_listed(over_both)}."
     if len(over_both) < len(higher):
         rest = {method: gain for method, gain in higher.items() if method not in over_both}
-        yield f"Higher {alone}, and over the chosen setting of plain fine-tuning alone: {_listed(rest)}."
+        yield f"On {name}, above plain fine-tuning at its chosen setting only, and {alone}: {_listed(rest)}."
     losses = _losses(gains)
     worse = {method: loss for method, loss in losses.items() if method in apart}
     if worse:
-        yield f"Told apart from plain fine-tuning as worse: {_listed(worse)}{_unlearned(rows, worse)}."
+        listed = f"{_listed(worse)}{_unlearned(rows, worse)}"
+        yield f"On {name}, below plain fine-tuning and told apart from it: {listed}."
     if len(worse) < len(losses):
         rest = {method: loss for method, loss in losses.items() if method not in worse}
-        yield f"Lower {alone}: {_listed(rest)}."
+        yield f"On {name}, below plain fine-tuning {alone}: {_listed(rest)}."
     yield from _over_tied_settings(name, tied)
 
 

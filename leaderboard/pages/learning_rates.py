@@ -93,9 +93,9 @@ def _at_the_first_rung(
             for other in dict.fromkeys((factor, best.factor))
         ]
         yield (
-            f"On {name}, methods without prior demonstrations keep at {rate_text(factor)}: {listed}. The "
-            f"first of them, `{falling[0]}`, keeps {' and '.join(over)}. This method, the best of "
-            f"{len(falling)}, and the rate of plain fine-tuning were both chosen on the same episodes."
+            f"On {name}, this is what methods without prior demonstrations keep at {rate_text(factor)}: "
+            f"{listed}. The first of them, `{falling[0]}`, keeps {' and '.join(over)}. This method, the best "
+            f"of {len(falling)}, and the rate of plain fine-tuning were both chosen on the same episodes."
         )
 
 

@@ -18,8 +18,8 @@ LOST = 0.5
 """Share of its validation episodes below which a skill counts as lost."""
 
 LOST_MEANS = (
-    "A skill is lost here if the policy does it in fewer than half of its validation episodes after the last "
-    "target. Each run measures the skill that succeeds least."
+    "Here, a skill counts as lost if the policy succeeds in fewer than half of its validation episodes after "
+    "the last target. Each run measures only the skill with the fewest successes."
 )
 
 
@@ -38,7 +38,7 @@ def relearning_sentences(boards: Mapping[str, Sequence[Row]]) -> list[str]:
             continue
         answers.append(
             f"On {name}, plain fine-tuning loses a skill in {len(lost)} of {seeds} ({_skills(lost)}). "
-            f"It meets the criterion again after {_steps(lost)} steps on its "
+            f"The policy meets the criterion again after {_steps(lost)} steps on the skill's "
             f"demonstrations{_never_again(lost)}."
             f"{_without_pretraining(by_method.get(FROM_SCRATCH), lost)}"
         )
@@ -52,7 +52,9 @@ def _never_again(lost: Sequence[Relearning]) -> str:
     count = sum(not one.met for one in lost)
     if not count:
         return ""
-    return f"; in {count} of these {len(lost)} seeds it never does, which counts as all steps of a stage"
+    return (
+        f"; in {count} of these {len(lost)} seeds it never does, which counts as the full budget of a stage"
+    )
 
 
 def _measured(row: Row | None) -> list[tuple[Relearning, float]]:

@@ -152,7 +152,7 @@ def _rates(method: str, sources: Sources) -> str:
     if own == other:
         return ""
     return (
-        f"Steps and speed also follow from the learning rate: `{FACTOR}` is {own:g} for `{method}` and "
+        f"Steps and speed also depend on the learning rate: `{FACTOR}` is {own:g} for `{method}` and "
         f"{other:g} for `{BASELINE}`."
     )
 
@@ -215,8 +215,8 @@ def _doubts(method: str) -> list[str]:
     ends: list[tuple[str, str]] = []
     for scenario, found in _tunings(method):
         sentences += [
-            f"On {scenario}, {_words(one.settings, '`{}`')} ties with the chosen setting, was tried later, "
-            "and has no row on the board."
+            f"On {scenario}, {_words(one.settings, '`{}`')} ties with the chosen setting; it was tried "
+            "later, so it has no row on the board."
             for one in rated_best(found.tried)
             if one.settings != found.settings
         ]
@@ -226,7 +226,7 @@ def _doubts(method: str) -> list[str]:
                 ends.append((end, scenario))
     if ends:
         where = listed(f"the {end} tried on {listed(scenarios)}" for end, scenarios in grouped(ends).items())
-        sentences.append(f"The chosen learning rate is {where}: a wider range might hold a better one.")
+        sentences.append(f"The chosen learning rate is {where}; a wider range might contain a better one.")
     return sentences
 
 

@@ -139,7 +139,7 @@ def start_text(rate: float | None) -> str:
     """
     if rate is None:
         return ""
-    sentence = f"The pretrained policy succeeds in {number_text(rate, '.2f')} of the episodes of its skills."
+    sentence = f"The pretrained policy has a success rate of {number_text(rate, '.2f')} on its skills."
     return sentence if rate >= WEAK else f"{sentence} {WEAK_WARNING}"
 
 
@@ -148,8 +148,8 @@ def machine_text(machine: str | None) -> str:
     if not machine:
         return ""
     return (
-        f"All these records were made on {machine}, where worlds move otherwise than on x86-64: compare them "
-        "with one another, and not with the published board."
+        f"All these records were made on {machine}, where the simulators behave differently than on "
+        "x86-64: compare these records only with one another, not with the published board."
     )
 
 
@@ -163,8 +163,9 @@ def unpaired_text(found: Mapping[str, Sequence[int]] | None) -> str:
         return ""
     names = "; ".join(f"{method} (seeds {', '.join(map(str, seeds))})" for method, seeds in found.items())
     return (
-        f"These runs began with another pretrained policy than sft's: {names}. Their gain compares unlike "
-        "runs. To mend it, run sft and these methods on one machine with a new --records folder."
+        f"These runs started from a different pretrained policy than sft's: {names}. Their gain therefore "
+        "compares runs that do not match. To fix this, run sft and these methods on one machine with a new "
+        "--records folder."
     )
 
 
@@ -192,9 +193,12 @@ def prediction_text(rows: Iterable[Row]) -> str:
     found = predictions(rows)
     if not found:
         return ""
-    words = {1: "", 0: " (not certain)", -1: ", the other way round"}
+    words = {1: "", 0: " (not certain)", -1: " (in the opposite order)"}
     parts = [f"{one.predictor} {tau_text(one)}, {one.rows} methods{words[one.direction]}" for one in found]
-    return f"Rank correlation with the share that a stage forgets (Kendall's tau): {'; '.join(parts)}."
+    return (
+        "Rank correlation (Kendall's tau) with the share that a method forgets in a stage: "
+        f"{'; '.join(parts)}."
+    )
 
 
 def tau_text(found: Agreement) -> str:
@@ -309,8 +313,8 @@ def over_tied(name: str, words: str, gain: Estimate, tied: Sequence[TiedGain]) -
             over = f"but {no_tied_runs(one)}"
         seeds = f" ({counted(one.seeds, 'seed')})" if one.seeds else ""
         yield (
-            f"On {name}, {'for' if sure else 'not for'} certain: {words} gains {chosen} over plain "
-            f"fine-tuning at the setting that tuning chose, {over}{seeds}."
+            f"On {name}, the gain of {words} is {'certain' if sure else 'not certain'}: it is {chosen} over "
+            f"plain fine-tuning at the setting that tuning chose, {over}{seeds}."
         )
 
 

@@ -146,7 +146,7 @@ def _fitted(
             break
         dropped += [head.title for head in kept if head.title == name and not head.stays]
         kept = [head for head in kept if head.title != name or head.stays]
-    line = f"Too wide for {width} columns: {', '.join(dropped)}. The page and --json show every column."
+    line = f"Not shown in {width} characters: {', '.join(dropped)}. The page and --json show every column."
     return [_table(title, rows, kept), *([Text(line, style="italic")] if dropped else [])]
 
 

@@ -208,9 +208,9 @@ def test_an_entry_with_a_foreign_file_is_named_and_left(capsys: pytest.CaptureFi
         _age(folder, 400)
     old = _make("scenes", 400)
     out = _cache(capsys, "--prune", "--older-than", "0")
-    assert f"{thesis.parent} is left: clbench did not make thesis.txt in it." in out
-    assert f"{stages} is left: clbench did not make b.txt and 1 more file in it." in out
-    assert f"{dataset} is left: clbench did not make data/mine.hdf5 in it." in out
+    assert f"{thesis.parent} is not deleted: clbench did not make thesis.txt in it." in out
+    assert f"{stages} is not deleted: clbench did not make b.txt and 1 more file in it." in out
+    assert f"{dataset} is not deleted: clbench did not make data/mine.hdf5 in it." in out
     assert "Deleted 1 stale entry" in out
     assert not old.exists()
     assert all(path.is_file() for path in (*foreign, stages / "stage-0" / "data"))
@@ -227,7 +227,7 @@ def test_records_on_their_way_are_deleted_and_other_json_is_left(
     for path in (ours, mixed, foreign):
         _age(path.parent, 40)
     out = _cache(capsys, "--prune")
-    assert f"{mixed.parent} is left: clbench did not make settings.json in it." in out
+    assert f"{mixed.parent} is not deleted: clbench did not make settings.json in it." in out
     assert not ours.parent.exists()
     assert all(path.is_file() for path in (mixed, settings, foreign))
 

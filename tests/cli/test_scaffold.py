@@ -179,7 +179,7 @@ def test_new_policy_prints_the_next_steps(
 ) -> None:
     clbench("new-policy", "diffusion")
     assert capsys.readouterr().out.splitlines() == [
-        "Wrote diffusion.py and test_diffusion.py. Make the policy yours, then:",
+        "Wrote diffusion.py and test_diffusion.py. Edit the policy, then run:",
         "  python -m pytest test_diffusion.py  # pip install pytest",
         "  clbench run clbench/Fetch-v1 sft --policy diffusion:Diffusion",
     ]
@@ -195,7 +195,7 @@ def test_the_command_prints_the_next_steps(
 ) -> None:
     clbench("new-method", "freshly_written")
     assert capsys.readouterr().out.splitlines() == [
-        "Wrote freshly_written.py and test_freshly_written.py. Make the method yours, then:",
+        "Wrote freshly_written.py and test_freshly_written.py. Edit the method, then run:",
         "  python -m pytest test_freshly_written.py  # pip install pytest",
         "  clbench submit freshly_written:FreshlyWritten",
     ]

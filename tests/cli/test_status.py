@@ -94,7 +94,7 @@ def test_a_record_of_other_settings_is_not_that_of_the_run(
     assert not has_record(RunSpec(TINY, "frozen", seed=0).resolve(), tmp_path)
     resolve("clbench.cli.status:status")(TINY, "frozen", seeds=1, records=tmp_path)
     shown = capsys.readouterr().out
-    assert "me--Tiny-v0/frozen/seed-0: to do, the record there has other settings, budget or code" in shown
+    assert "me--Tiny-v0/frozen/seed-0: to do, its record has different settings, budget or code" in shown
     assert "1 run: 1 to do." in shown
     resolve("clbench.cli.status:status")(records=tmp_path)
     assert "1 run: 1 done." in capsys.readouterr().out

@@ -195,7 +195,7 @@ def test_a_folder_without_rows_lists_why_and_replaces_no_board(
     assert stopped.value.code == 2
     shown = capsys.readouterr().err
     assert "torn.json: cannot be read as JSON" in shown
-    assert "makes a row, and no board was written" in shown
+    assert "makes a row, so no board was written" in shown
     assert [path.name for path in tmp_path.iterdir()] == ["records"]
     assert load(tmp_path / "records").empty
     assert "retention_low" in load(tmp_path / "records")

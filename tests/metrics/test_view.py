@@ -72,7 +72,7 @@ def test_a_value_without_an_interval_beside_others_says_why() -> None:
     assert "one 0.850 (one seed)" in values
     assert "alike 0.850 (seeds agree)" in values
     assert "two 0.800 [" in values
-    assert "Seeds: 1 to 2; the mean of their values, and its 95 % interval." in shown
+    assert "Seeds: 1 to 2. Values are means over seeds, with 95 % intervals." in shown
     alone = lines(from_matrix({"one": MINE, "other": LESS}))
     assert not any("seed)" in line or line.startswith("Seeds: ") for line in alone)
 

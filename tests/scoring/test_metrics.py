@@ -188,8 +188,9 @@ def test_the_description_of_a_metric_has_its_formula_source_direction_and_missin
 
 
 def test_a_ratio_and_a_pooled_metric_say_how_seeds_are_averaged() -> None:
-    assert "Seeds: the geometric mean of their values\n" in metric_pages.text(METRICS["speed"])
-    assert "Seeds: averaged before it is computed\n" in metric_pages.text(METRICS["forward_transfer"])
+    assert "Seeds: geometric mean over seeds\n" in metric_pages.text(METRICS["speed"])
+    pooled = metric_pages.text(METRICS["forward_transfer"])
+    assert "Seeds: averaged over seeds first, then computed once\n" in pooled
 
 
 def test_every_drop_is_a_difference_of_success_rates_whether_or_not_it_can_be_negative() -> None:
@@ -216,6 +217,6 @@ def test_all_about_a_metric_is_exact() -> None:
         "Range: 0 to 1\n"
         "Units: success rate\n"
         "Compared with: nothing\n"
-        "Seeds: the mean of their values\n"
+        "Seeds: mean over seeds\n"
         "None means: There are no retained skills, or the success on one after the last target is missing.\n"
     )

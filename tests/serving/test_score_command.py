@@ -87,7 +87,7 @@ def test_the_command_says_that_no_board_shows_a_tuning_seed(
         ({"method": "sft"}, "error: 'sft' is a method of clbench"),
         (
             {"picture_size": 8},
-            "--picture-size is the size of the pictures of --pictures: name cameras there.",
+            "--picture-size needs --pictures: name the cameras there.",
         ),
     ],
 )

@@ -88,7 +88,8 @@ def _disagreements(metrics: Iterable[Metric], rows: Sequence[Row]) -> tuple[froz
         return frozenset(), "All definitions put the methods in the same order."
     return frozenset(depends), (
         f"“{title_of(names[0])}” and “{title_of(names[1])}” disagree most. They put {worst} of {len(pairs)} "
-        f"pairs of methods in opposite orders; for {clear} of these, the intervals overlap under neither."
+        f"pairs of methods in opposite orders; for {clear} of these, the intervals do not overlap under "
+        "either definition."
     )
 
 

@@ -52,7 +52,9 @@ def cost(row: Row) -> Number:
     """Return the relative cost."""
     relative = row.costs["relative_cost"]
     if relative is None:
-        return Number(MISSING, note="missing: its runs did not measure the time of a step, or sft has none")
+        return Number(
+            MISSING, note="missing: the time of a step was not measured, for this method or for sft"
+        )
     return Number(times_text(relative), number_text(relative, ".6f"))
 
 

@@ -82,12 +82,13 @@ def headline(rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]] | None 
     sides = certain_sides(rows, tied or {})
     ahead = [row for row in others if sides.get(row.method) == 1]
     if not apart and all(len(row.seeds) == 1 for row in members):
-        methods = "the one other method cannot" if len(others) == 1 else "no method can"
+        methods = "the only other method cannot" if len(others) == 1 else "no method can"
         return (
-            f"One seed: {methods} be told apart from plain fine-tuning. The intervals cover episodes alone."
+            f"With one seed, {methods} be told apart from plain fine-tuning: the intervals cover only the "
+            "noise of episodes."
         )
     if not ahead:
-        methods = "The one other method is not" if len(others) == 1 else "No method is"
+        methods = "The only other method is not" if len(others) == 1 else "No method is"
         return f"{methods} shown to end above plain fine-tuning."
     first = _above(ahead, gains)
     left = len(others) - len(ahead)
@@ -153,7 +154,7 @@ def _standing(leader: Row, rows: Iterable[Row]) -> str:
     value = number_text(leader.estimates[RANKED_BY].value, ".2f")
     if standing is None or standing.count == 1:
         return f"It is alone in its division, with a final average of {value}."
-    first = f"In final average ({value}) it is first of {standing.count}"
+    first = f"It ranks first of {standing.count} in final average ({value})"
     if len(standing.alike) == 1:
         return f"{first}; {_names(standing.alike)} is not told apart from it."
     if standing.alike:
@@ -175,7 +176,7 @@ def _doubt(leader: Row, rows: Sequence[Row], apart: Container[str], tied: Sequen
         count = sum(row.division in family and row.method != BASELINE for row in rows)
         kind = "without" if family is WITHOUT_DEMONSTRATIONS else "with"
         return (
-            "Its gain is above 0 by its own interval alone, but not told apart from 0 when all "
+            "Its own interval puts its gain above 0, but the gain is not told apart from 0 when all "
             f"{count} methods {kind} prior demonstrations are compared with sft."
         )
     unsure = [one for one in tied if not one.is_certain]
@@ -184,8 +185,8 @@ def _doubt(leader: Row, rows: Sequence[Row], apart: Container[str], tied: Sequen
     if not unsure[0].seeds:
         return f"Its gain is not certain: for plain fine-tuning, {no_tied_runs(unsure[0])}."
     return (
-        f"Tuning rated sft as highly at {rate_text(unsure[0].factor)}; over that setting, the gain is "
-        f"{format_interval(unsure[0].gain, '+.2f')} and not certain."
+        f"Tuning rated sft equally highly at {rate_text(unsure[0].factor)}. Over that setting, the gain is "
+        f"{format_interval(unsure[0].gain, '+.2f')}, which is not certain."
     )
 
 
@@ -209,13 +210,13 @@ def _keeping(members: Sequence[Row], baseline: Row | None) -> str:
         other = f"The other, {name}," if len(members) == 2 else f"Of the others, {name}"
         which = "It" if keeper is leader else other
         return f"{slower}{which} {_beside(keeper, baseline)} {_training(keeper, baseline, whose)}"
-    kept, like = _value("kept", keeper), "Of the methods not told apart from sft in what they learn"
+    kept, like = _value("kept", keeper), "Among the methods whose learning is not told apart from sft's"
     if keeper.method == BASELINE:
         return f"{slower}{like}, none keeps more than sft itself ({kept})."
     peers = _alike("kept", keeper.method, {row.method: row for row in equal})
-    sure = f"; in this, {_alike_text(len(peers) - 1)}" if len(peers) > 1 else ""
+    sure = f"; {_alike_text(len(peers) - 1)} in this respect" if len(peers) > 1 else ""
     if BASELINE in peers:
-        sure = f", but is not told apart from sft ({_value('kept', baseline)}) in this"
+        sure = f", but what it keeps is not told apart from sft's ({_value('kept', baseline)})"
     return f"{slower}{like}, {name} keeps the most ({kept}){sure}. {_training(keeper, baseline, whose)}"
 
 
@@ -225,10 +226,14 @@ def _beside(row: Row, baseline: Row) -> str:
         f"{_value(name, row)} ({BASELINE} {_value(name, baseline)})" for name in ("adaptation", "kept")
     )
     if len({*row.seeds} & {*baseline.seeds}) < 2:
-        return f"learns {learned} and keeps {kept}, with one seed alone."
+        return f"learns {learned} and keeps {kept}, with only one seed."
     is_alike = baseline.method in _alike("kept", row.method, {one.method: one for one in (row, baseline)})
-    sure = "neither difference is" if is_alike else "only the difference in what is kept is"
-    return f"learns {learned} and keeps {kept}; {sure} told apart."
+    sure = (
+        "it is told apart from sft in neither"
+        if is_alike
+        else "it is told apart from sft only in what it keeps"
+    )
+    return f"learns {learned} and keeps {kept}; {sure}."
 
 
 def _training(row: Row, baseline: Row, whose: str = "Its") -> str:

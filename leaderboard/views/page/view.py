@@ -113,7 +113,7 @@ class ScenarioView:
         policy = f"A policy with {counted(skills, 'skill')}" if skills else "A policy"
         seeds = sorted({len(view.row.seeds) for view in self.rows})
         count = counted(seeds[0], "seed") if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]} seeds"
-        numbers = "Results of one seed" if seeds == [1] else f"Means over {count}"
+        numbers = "Values are from one seed" if seeds == [1] else f"Values are means over {count}"
         turns = ", one after another" if targets > 1 else ""
         sentences = [
             f"{policy} is fine-tuned on {counted(targets, 'new task')}{turns}.",
@@ -264,7 +264,7 @@ def _other_policy(policy: str) -> list[str]:
     if policy == DEFAULT_POLICY or not is_built_in(policy):
         return []
     size = size_of(policy)
-    layers = f", with {size[0]} channels of a token and {counted(size[1], 'layer')}" if size else ""
+    layers = f", with {size[0]} channels per token and {counted(size[1], 'layer')}" if size else ""
     return [f"The policy is {title_of(policy)}{layers}: {POLICIES[kind_of(policy)]}."]
 
 

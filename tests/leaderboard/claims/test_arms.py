@@ -58,9 +58,9 @@ def test_an_arm_that_does_not_count_and_keeps_a_claim_from_failing_is_named_as_s
     given = {**shares(0.05, 0.2), **kept((0.25, 0.35), (0.0, 0.1)), **kept((0.0, 0.1), (0.0, 0.1), rung="@1")}
     finding = judged("C2", given)
     assert finding.verdict == "undecided"
-    assert (
-        finding.change
-        == 'An interval of "retained success, consft - sft" below 0.20: its arm does not count.'
+    assert finding.change == (
+        'An interval of "retained success, consft - sft" that lies below 0.20: its arm does not count, but '
+        "it keeps the claim from failing."
     )
 
 

@@ -91,7 +91,7 @@ def test_the_page_shows_what_the_verdict_is_made_of(page: Any) -> None:
     assert "| speed-up of the pipeline, blocks of 4 steps | 2.50 [2.45, 2.55] |" in entry
     assert "| also: tokens in all forwards, easy first / pipeline, blocks of 4 steps | 6.00 |" in entry
     assert "speed-up of the head alone at width 768, initial weights | 3.30 [3.25, 3.35] |" in entry
-    assert "only fewer forwards save time here" in entry
+    assert "only fewer passes save time here" in entry
 
 
 def test_one_forward_that_succeeds_as_often_leaves_nothing_to_speed_up(page: Any) -> None:
@@ -100,7 +100,7 @@ def test_one_forward_that_succeeds_as_often_leaves_nothing_to_speed_up(page: Any
     values["decoders"]["one forward"]["forwards"] = 1.0
     made = page(values)
     assert verdicts(made)["F6"] == "cannot be shown here"
-    assert "One forward certainly succeeds at most 0.03 less often than 12" in section(made, "F6")
+    assert "One forward pass certainly succeeds at most 0.03 less often than 12" in section(made, "F6")
     values["decoders"]["one forward"]["success_difference"] = [-0.1, -0.12, -0.08]
     assert verdicts(page(values))["F6"] == "does not hold"
 

@@ -194,7 +194,7 @@ def test_the_seeds_that_would_decide_are_those_whose_interval_ends_at_the_bar(di
     deviation = 0.2 / stats.t.ppf(0.975, 3) * 2  # half of the width with 4 seeds is 0.2
     halves = {n: stats.t.ppf(0.975, n - 1) * deviation / n**0.5 for n in range(4, 101)}
     needed = next((f"about {n}" for n, half in halves.items() if half <= distance), "more than 100")
-    assert f"At this spread {needed} seeds: " in what_would_change(figure, 0.05)
+    assert f"At this spread, {needed} seeds would be needed: " in what_would_change(figure, 0.05)
 
 
 def test_a_run_in_another_order_of_the_targets_is_no_evidence(bench: Bench, add: Callable[..., None]) -> None:

@@ -298,7 +298,7 @@ def test_an_arm_that_does_not_count_is_shown_with_the_verdict_that_it_would_give
     bench.add("consft_calibrated", earlier=0.4, diagnostics=ACTIVE)
     finding = bench.judge("C7")
     assert finding.verdict == "undecided"
-    assert 'If consft counted: "holds".' in finding.sentences
+    assert 'If consft counted, the verdict would be "holds".' in finding.sentences
     (same,) = [one for one in bench.judge("C2").sentences if one.startswith("If consft counted")]
     assert same == "If consft counted, the verdict would be the same."
     assert {one.methods for one in finding.controls} >= {("consft",), ("consft", "sft")}
@@ -330,7 +330,7 @@ def test_the_distance_to_the_anchor_is_that_of_the_same_seed_with_a_random_direc
     assert finding.verdict == "holds in part"
     assert near.value == pytest.approx((0.010 * 0.011 * 0.009) ** (1 / 6))
     on_questions, begins = finding.sentences
-    assert "their distance to the anchor is 9.5 before the first step. It ends at 1.7." in begins
+    assert "their distance to the anchor is 9.5 even before the first step. It ends at 1.7." in begins
     assert "move 0.91 [0." in on_questions
     assert drift.value == pytest.approx((0.9 / (1.0 * 1.1 * 1.2) ** (1 / 3)) ** 0.5, abs=0.001)
     bench.add("frozen")

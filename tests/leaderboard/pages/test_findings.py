@@ -47,7 +47,7 @@ def test_a_method_that_is_certainly_better_is_named_with_its_gain(
     assert re.search(r"Without prior demonstrations: `finch` gains 0\.30 \[.*?\] on clbench/Even-v1\.", text)
     assert "With prior demonstrations: no method is certainly better than tuned plain fine-tuning on" in text
     assert "On clbench/Even-v1, yes: `finch` by 0.300 [" in text
-    assert "Told apart from plain fine-tuning as worse: `l2_sp` by 0.300 [" in text
+    assert "below plain fine-tuning and told apart from it: `l2_sp` by 0.300 [" in text
     table = text.partition("| scenario | method | gain |")[2]
     assert [line.split(" | ")[1] for line in table.splitlines()[2:5]] == ["finch", "lora", "l2_sp"]
 
@@ -59,8 +59,8 @@ def test_without_one_the_page_says_so_and_names_the_largest_gain(
     fill(even_board, sft=0.4, finch=0.4, lora=0.4)
     text = page()
     assert (
-        "none is told apart from plain fine-tuning as better: the largest gain of 2 methods, that of "
-        "`finch`, is 0.000"
+        "no method is above plain fine-tuning and told apart from it: the largest gain of 2 methods is that "
+        "of `finch`, 0.000"
     ) in text
     assert re.search(
         r"To be told apart, a gain must exceed 0\.\d{3}( to 0\.\d{3}, depending on the method)?\.", text
@@ -75,12 +75,12 @@ def test_a_difference_that_is_certain_only_without_counting_the_comparisons_is_s
     fill(even_board, sft=0.4, finch=0.5, lora=0.3, **same)
     text = page()
     assert (
-        "none is told apart from plain fine-tuning as better: the largest gain of 9 methods, that of "
-        "`finch`, is 0.0"
+        "no method is above plain fine-tuning and told apart from it: the largest gain of 9 methods is that "
+        "of `finch`, 0.0"
     ) in text
-    alone = "by its own interval alone, without correction for 9 comparisons"
-    assert f"Higher {alone}: `finch` by 0.0" in text
-    assert f"Lower {alone}: `lora` by 0.0" in text
+    alone = "by its own interval only (not corrected for 9 comparisons)"
+    assert f"above plain fine-tuning {alone}: `finch` by 0.0" in text
+    assert f"below plain fine-tuning {alone}: `lora` by 0.0" in text
 
 
 @pytest.mark.long
@@ -149,7 +149,7 @@ def test_a_gain_that_is_not_certain_over_a_tied_setting_is_no_yes(
         even_board("sft", seed, 0.8, "ladder", step_factor=0.1)
     text = page()
     assert "On clbench/Even-v1, yes" not in text
-    assert "On clbench/Even-v1, not for certain: `finch` gains 0.300" in text
+    assert "On clbench/Even-v1, the gain of `finch` is not certain: it is 0.300" in text
     assert (
         "but 0.000 [0.000, 0.000] at 0.1 times the scenario's learning rate, which scored the same in tuning "
         "(4 seeds)." in text
@@ -172,7 +172,7 @@ def test_claims_that_hold_are_named_since_some_are_about_plain_fine_tuning(
     every = (judged("C1", "a", "holds", "lost"), judged("C1", "b", "undecided", "lost"))
     monkeypatch.setattr("clbench.leaderboard.claims.judges.judge_all", lambda *_: every)
     fill(even_board, sft=0.4)
-    words = "C1, Fine-tuning without constraint degrades pretrained skills (on 1 of 2 boards)."
+    words = "C1, Unconstrained fine-tuning degrades pretrained skills (on 1 of 2 boards)."
     assert f"of 2 verdicts, 1 holds and 1 is undecided. What holds: {words}" in page()
 
 
@@ -216,11 +216,14 @@ def test_a_claim_is_a_line_with_a_verdict_for_each_board_what_explains_it_and_wh
     assert "Half are 0" not in section
     assert "Nothing explains it" not in section
     assert "- What would show C2 and C7 on c: longer stages.\n" in section
-    conditions = "the one scenario that was made to show it, by training far past learning and in large steps"
+    conditions = (
+        "the one scenario that was made to show it, with large steps and training that goes on long after "
+        "the target is learned"
+    )
     assert f"- A4 on d, {conditions}: It keeps none.\n" in section
     assert "- ConSFT: of 3 verdicts, 2 do not hold and 1 cannot be shown here. C7 is our reading" in section
     assert "is our reading of the paper and is not counted: of 2 verdicts, 1 is undecided" in section
-    assert "| id | claim | first figure | a | b | c | d |\n" in section
+    assert "| id | claim | measured quantity | a | b | c | d |\n" in section
     value, none = "0.25 [0.12, 0.50]", "cannot be shown here"
     cells = f"kept | does not hold: {value} | does not hold: {value} | {none}: {value} |  |"
     assert f"| C2 | {every[0].claim.words} | {cells}\n" in section
@@ -245,7 +248,7 @@ def test_how_fast_lost_skills_come_back_is_told_with_their_names(
             write_record(record, record_path(tmp_path / "records", "clbench/Even-v1", method, seed))
     text = page()
     assert "plain fine-tuning loses a skill in 2 of 2 seeds (`skill_1` in 2)." in text
-    assert "It meets the criterion again after 10 [" in text
+    assert "The policy meets the criterion again after 10 [" in text
     told = "A policy without pretraining, which has learned the targets, takes 20 (`skill_1` in 2)." in text
     assert told == (other == "skill_1"), "another skill says nothing of this one"
 
@@ -264,7 +267,7 @@ def test_a_skill_that_does_not_come_back_is_said_to_be_gone(
             relearning=Relearning("skill_1", 0, 20 if seed else 8, not seed),
         )
         write_record(record, record_path(tmp_path / "records", "clbench/Even-v1", "sft", seed))
-    assert "; in 2 of these 3 seeds it never does, which counts as all steps of a stage." in page()
+    assert "; in 2 of these 3 seeds it never does, which counts as the full budget of a stage." in page()
 
 
 @pytest.mark.long
@@ -292,7 +295,7 @@ def test_definitions_that_order_the_methods_alike_have_a_tau_of_one(
 ) -> None:
     fill(even_board, sft=0.2, finch=0.6, lora=0.4, l2_sp=0.1, stop_gradient=0.3, aegis=0.5)
     text = page()
-    assert "On clbench/Even-v1, Kendall's tau between the final average and other definitions is: " in text
+    assert "On clbench/Even-v1, Kendall's tau between the final average and other metrics is: " in text
     assert "forgetting 1.00" in text
     assert "these figures describe the board, and are not a test." in text
     alike = (
@@ -303,9 +306,9 @@ def test_definitions_that_order_the_methods_alike_have_a_tau_of_one(
     assert f"without methods that read prior demonstrations, {alike}" in text
     # every seed is the same: the method explains all
     assert (
-        "4 seeds, the method explains 100%, and the seed with its order of the targets 0% (omega squared)."
-        in text
-    )
+        "the method explains 100% of the variance of the final average, and the seed with its order of the "
+        "targets 0% (omega squared; 4 methods without prior demonstrations, 4 seeds)."
+    ) in text
 
 
 def test_boards_with_a_fixed_number_of_steps_also_tell_what_is_lost_of_skills_and_knowledge(
@@ -318,7 +321,7 @@ def test_boards_with_a_fixed_number_of_steps_also_tell_what_is_lost_of_skills_an
     findings(records=tmp_path / "leaderboard/records", controls=tmp_path / "controls", output=output)
     section = output.read_text(encoding="utf-8").partition("## Are skills and knowledge lost together?")[2]
     assert "On clbench/Toy-v0, where stages have a fixed length, success on the skills goes from " in section
-    assert re.search(r"and the share of right answers goes from 0\.\d\d .* to 0\.50", section)  # 25 of 50
+    assert re.search(r"and the share of correct answers goes from 0\.\d\d .* to 0\.50", section)  # 25 of 50
 
 
 @pytest.mark.long

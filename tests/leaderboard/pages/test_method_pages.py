@@ -209,7 +209,7 @@ def test_the_claims_on_a_method_are_linked_with_their_verdicts(bench: Bench) -> 
     pages = bench.pages()
     boards = ("Fetch-v1", "MetaWorld-v1", "PointMaze-v1", "LiberoSpatial-v1")
     all_of_them = ", ".join(f"undecided ({scenario})" for scenario in boards)
-    assert f"- [C1](../claims.md#c1), {all_of_them}: Fine-tuning" in part(pages["sft"], "Results here")
+    assert f"- [C1](../claims.md#c1), {all_of_them}: Unconstrained" in part(pages["sft"], "Results here")
     for identifier in ("C2", "C5", "C8"):
         assert f"[{identifier}](../claims.md#{identifier.lower()})" in part(pages["consft"], "Results here")
     section = part(pages["constant_weight"], "Results here")
@@ -261,7 +261,7 @@ def test_steps_and_speed_are_shown_with_the_learning_rates_that_they_follow_from
         row.runs[0].record.run.settings["step_factor"] = rates[row.method]
     results = results_of(rows)
     sentence = (
-        "Steps and speed also follow from the learning rate: `step_factor` is 0.03 for `fast_dvla` and 0.3 "
+        "Steps and speed also depend on the learning rate: `step_factor` is 0.03 for `fast_dvla` and 0.3 "
         "for `sft`."
     )
     assert sentence in results["fast_dvla"].splitlines()
@@ -304,8 +304,8 @@ def test_a_setting_that_ties_with_the_chosen_one_is_told(
     )
     pages = bench.pages()
     assert [line for line in pages["finch"].splitlines() if " ties " in line] == [
-        "On clbench/MetaWorld-v1, `kappa` = 0.3, `step_factor` = 0.1 ties with the chosen setting, was tried "
-        "later, and has no row on the board."
+        "On clbench/MetaWorld-v1, `kappa` = 0.3, `step_factor` = 0.1 ties with the chosen setting; it was "
+        "tried later, so it has no row on the board."
     ]
     assert " ties " not in pages["sft"]
 
@@ -334,7 +334,7 @@ def test_a_chosen_learning_rate_at_an_end_of_those_tried_is_told(
         "the smallest tried on clbench/Fetch-v1 and clbench/PointMaze-v1 and the largest tried on "
         "clbench/MetaWorld-v1"
     )
-    assert told["a_gem"] == [f"The chosen learning rate is {ends}: a wider range might hold a better one."]
+    assert told["a_gem"] == [f"The chosen learning rate is {ends}; a wider range might contain a better one."]
     assert len(told["ewc"]) == 1
     assert told["sft"] == told["consft"] == []  # between two others or the only one; not tuned
 
@@ -358,8 +358,8 @@ def test_a_control_names_the_method_whose_settings_it_has_and_lists_none_of_its_
         lambda scenario: found if scenario == "clbench/MetaWorld-v1" else {},
     )
     page = bench.pages()["constant_weight"]
-    has = "It has the settings tuned for `consft_calibrated`: `loss_scale` = 0.01 on clbench/MetaWorld-v1."
-    assert part(page, "Hyper-parameters").endswith(has)
+    has = "It uses the settings that were tuned for `consft_calibrated`: `loss_scale` = 0.01 on "
+    assert part(page, "Hyper-parameters").endswith(f"{has}clbench/MetaWorld-v1.")
     assert "Settings tried" not in page
     assert "clbench tune clbench/MetaWorld-v1 consft_calibrated --write" in part(page, "Command")
 

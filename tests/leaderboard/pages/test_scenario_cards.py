@@ -238,7 +238,7 @@ def test_without_any_record_the_card_says_so_and_invents_nothing(bench: Bench) -
     assert f"`{command}` makes them." in card
     assert {tuple(cells[1:]) for cells in bars(card).values()} == {("-", "-")}
     assert part(card, "How small a difference it resolves").startswith(
-        "Unknown: it takes records of at least two methods of one division"
+        "Unknown: it needs records of at least two methods of one division"
     )
     assert part(card, "Order of the targets").startswith("The records have the published order only.")
 

@@ -87,18 +87,20 @@ def test_only_an_agreement_beyond_chance_is_called_one() -> None:
 
 def test_a_table_of_another_kind_of_processor_warns_of_the_published_one() -> None:
     assert machine_text(None) == machine_text("") == ""
-    assert machine_text("aarch64").startswith("All these records were made on aarch64, where worlds move ")
+    assert machine_text("aarch64").startswith(
+        "All these records were made on aarch64, where the simulators behave "
+    )
 
 
 def test_runs_that_did_not_begin_like_plain_fine_tuning_are_named_with_a_way_out() -> None:
     assert unpaired_text(None) == ""
     assert unpaired_text({"mine:Mine": [1, 2], "lora": [3]}) == (
-        "These runs began with another pretrained policy than sft's: mine:Mine (seeds 1, 2); lora (seeds 3). "
-        "Their gain compares unlike runs. To mend it, run sft and these methods on one machine with "
-        "a new --records folder."
+        "These runs started from a different pretrained policy than sft's: mine:Mine (seeds 1, 2); lora "
+        "(seeds 3). Their gain therefore compares runs that do not match. To fix this, run sft and these "
+        "methods on one machine with a new --records folder."
     )
 
 
 def test_a_pretrained_policy_at_the_bar_is_not_weak() -> None:
-    assert start_text(WEAK) == "The pretrained policy succeeds in 0.80 of the episodes of its skills."
+    assert start_text(WEAK) == "The pretrained policy has a success rate of 0.80 on its skills."
     assert start_text(WEAK - 0.01).endswith(WEAK_WARNING)

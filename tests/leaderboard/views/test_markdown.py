@@ -140,7 +140,7 @@ def test_a_gain_that_another_setting_of_plain_fine_tuning_takes_back_is_told_bel
         records = even_board("lora", seed, 0.9)
     board = compute_board(records)
     tied = {"lora": (TiedGain(0.1, Estimate(0.007, -0.016, 0.03), 4),)}
-    assert "not for certain" not in markdown(board, {})
+    assert "is not certain: it is" not in markdown(board, {})
     assert (
         "but 0.007 [-0.016, 0.030] at 0.1 times the scenario's learning rate, which scored the same in "
         "tuning (4 seeds)."

@@ -192,8 +192,9 @@ def test_records_that_are_all_of_arm_make_a_table_that_says_so(
             "sft", seed, edit=on_arm, scenario="clbench/Fetch-v1", place=f"Fetch-v1/sft/seed-{seed}.json"
         )
     for text in shown():
-        assert "All these records were made on arm64, where worlds move otherwise than on x86-64" in flat(
-            text
+        assert (
+            "All these records were made on arm64, where the simulators behave differently than on x86-64"
+            in flat(text)
         )
         reason = "its scenario is not that of most records: task press differ."
         assert f"Fetch-v1/sft/seed-2.json: {reason}" in flat(text)

@@ -47,7 +47,7 @@ def test_a_narrow_terminal_loses_whole_columns_and_says_which(
     printed, _ = shown()
     table, _, _ = printed.partition("Written: ")
     assert max(map(len, table.splitlines())) <= width
-    assert f"Too wide for {width} columns: {lost}" in " ".join(printed.split())
+    assert f"Not shown in {width} characters: {lost}" in " ".join(printed.split())
     row = next(line for line in printed.splitlines() if "experience_replay" in line)
     assert "±" in row
     assert "…" not in printed
@@ -104,7 +104,7 @@ def test_a_narrow_terminal_keeps_the_column_that_it_is_sorted_by(
     heads, legends = [], []
     for sort in ([], ["--sort", metric]):
         app([*arguments, *sort], result_action="return_value")
-        head, _, legend = capsys.readouterr().out.partition("Too wide")
+        head, _, legend = capsys.readouterr().out.partition("Not shown in")
         heads.append(head.split())
         legends.append(" ".join(legend.split()))
     assert ("activation drift" in legends[1]) == (metric == "activation_drift")  # where lower is better
@@ -161,7 +161,7 @@ def test_a_weak_pretrained_policy_is_named_on_every_form_of_the_board(
         add_full("sft", seed, np.vstack([np.full((1, 5), 0.3), matrix[1:]]))
     printed, markdown = shown_with_page()
     page = (four_methods.parent / "site" / "index.html").read_text(encoding="utf-8")
-    sentence = "The pretrained policy succeeds in 0.30 of the episodes of its skills. That is little: "
+    sentence = "The pretrained policy has a success rate of 0.30 on its skills. That is low: "
     for text in (printed, markdown, page):
         assert sentence in " ".join(text.split())
 

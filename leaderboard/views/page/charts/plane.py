@@ -159,7 +159,7 @@ class Plane:
             f"{row.method} ({', '.join(self._value(axis.quantity, row) for axis in (self.across, self.up))})"
             for row in self.outside
         ]
-        return f"Not in the picture: {'; '.join(texts)}." if texts else ""
+        return f"Not in the chart: {'; '.join(texts)}." if texts else ""
 
     def _value(self, quantity: Quantity, row: RowSummary) -> str:
         one = quantity.of(row)

@@ -334,7 +334,7 @@ def test_without_rows_there_is_a_page_that_says_why(tmp_path: Path) -> None:
     (tmp_path / "torn.json").write_text("{", encoding="utf-8")
     table = compute_board(tmp_path)
     text = words(parsed(page(table, {})))
-    assert "There is no row yet" in text
+    assert "There are no rows yet" in text
     assert "torn.json" in text
     assert set(pictures(table)) == {"pareto.svg", "pareto-dark.svg"}
 

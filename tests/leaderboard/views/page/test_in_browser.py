@@ -134,7 +134,7 @@ def test_a_click_on_a_head_sorts_and_a_second_one_the_other_way(open_page: Calla
 
 def test_divisions_are_sorted_apart_until_the_reader_wants_one_list(open_page: Callable[..., Page]) -> None:
     page = open_page("clbench/Toy-v0")
-    page.get_by_label("sort inside divisions").locator("visible=true").uncheck()
+    page.get_by_label("sort within divisions").locator("visible=true").uncheck()
     assert names(page) == ["x_with_a_name_that_is_longer_than_a_phone", "other", "replay", "l2", "sft"]
     expect(page.locator(".division-head:visible")).to_have_count(0)
     expect(page.locator("td.division:visible")).to_have_count(5)
@@ -395,19 +395,19 @@ def test_the_reader_chooses_the_axes_and_reads_why_a_picture_is_empty(open_page:
     form = page.locator("[id='clbench/Toy-v0'] form")
     picture = page.locator("[id='clbench/Toy-v0'] figure[data-plane]")
     expect(picture).to_contain_text("learned: success on each new task")
-    form.get_by_label("Upward").select_option("kept skills")
+    form.get_by_label("Vertical axis").select_option("kept skills")
     expect(picture).to_contain_text("kept skills: success on the old skills")
-    form.get_by_label("Across").select_option("relative cost")
+    form.get_by_label("Horizontal axis").select_option("relative cost")
     expect(picture).to_contain_text("relative cost, less is better")
     note = page.locator("[data-plane-note]:visible")
     expect(note).to_contain_text(
-        "Not in the picture: x_with_a_name_that_is_longer_than_a_phone (no relative cost, kept skills"
+        "Not in the chart: x_with_a_name_that_is_longer_than_a_phone (no relative cost, kept skills"
     )
     page.get_by_role("link", name="Without-v0").click()
-    page.get_by_label("Across").locator("visible=true").select_option("relative cost")
+    page.get_by_label("Horizontal axis").locator("visible=true").select_option("relative cost")
     expect(page.locator("figure[data-plane]:visible svg")).to_have_count(0)
     expect(note).to_contain_text(
-        "No method here has both kept and relative cost. Not in the picture: alone (no relative cost"
+        "No method here has both kept and relative cost. Not in the chart: alone (no relative cost"
     )
 
 

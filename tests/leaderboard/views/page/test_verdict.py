@@ -1,6 +1,7 @@
 """The verdict of a scenario: sentences that hold for any records, and call nothing best that is not."""
 
 import dataclasses
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -115,11 +116,11 @@ def test_a_leader_that_is_not_told_apart_is_said_to_be_so(board: Callable[..., A
     (verdict,) = verdicts(rows)
     final = verdict.leader.estimates["final_average"].value
     assert verdict.standing == (
-        f"In final average ({final:.2f}) it is first of 3; 2 are not told apart from it: lora and sft."
+        f"It ranks first of 3 in final average ({final:.2f}); 2 are not told apart from it: lora and sft."
     )
     assert verdict.keeping == (
-        "Of the methods not told apart from sft in what they learn, it keeps the most (0.60), but is not "
-        "told apart from sft (0.50) in this. Its training time was not measured."
+        "Among the methods whose learning is not told apart from sft's, it keeps the most (0.60), but what "
+        "it keeps is not told apart from sft's (0.50). Its training time was not measured."
     )
 
 
@@ -136,24 +137,32 @@ def test_the_method_that_keeps_most_is_found_on_the_seeds_of_plain_fine_tuning(
 
 def test_the_one_method_that_is_not_told_apart_from_a_leader_is_named(board: Callable[..., Any]) -> None:
     (verdict,) = verdicts(board(sft=matrix(0.5), lora=matrix(0.6)))
-    assert verdict.standing.endswith("it is first of 2; sft is not told apart from it.")
-    assert "it keeps the most (0.60), but is not told apart from sft (0.50) in this." in verdict.keeping
+    assert re.fullmatch(
+        r"It ranks first of 2 in final average \(0\.\d\d\); sft is not told apart from it\.", verdict.standing
+    )
+    assert (
+        "it keeps the most (0.60), but what it keeps is not told apart from sft's (0.50)." in verdict.keeping
+    )
 
 
 def test_no_method_keeps_more_than_plain_fine_tuning(board: Callable[..., Any]) -> None:
     (verdict,) = verdicts(board(sft=matrix(0.9), lora=matrix(0.2), finch=matrix(0.1)))
     assert verdict.keeping == (
-        "Of the methods not told apart from sft in what they learn, none keeps more than sft itself (0.90)."
+        "Among the methods whose learning is not told apart from sft's, none keeps more than sft itself "
+        "(0.90)."
     )
 
 
 def test_a_leader_that_is_told_apart_from_all_is_said_to_be_so(board: Callable[..., Any]) -> None:
     (verdict,) = verdicts(board(sft=matrix(0.1), lora=matrix(0.9), finch=matrix(0.1)))
     assert verdict.leader.method == "lora"
-    assert verdict.standing.endswith("it is first of 3, told apart from all others of its division.")
+    assert re.fullmatch(
+        r"It ranks first of 3 in final average \(0\.\d\d\), told apart from all others of its division\.",
+        verdict.standing,
+    )
     assert verdict.keeping == (
-        "Of the methods not told apart from sft in what they learn, it keeps the most (0.90). Its training "
-        "time was not measured."
+        "Among the methods whose learning is not told apart from sft's, it keeps the most (0.90). Its "
+        "training time was not measured."
     )
 
 
@@ -198,8 +207,8 @@ def test_a_leader_that_learns_less_does_not_keep_most_of_those_that_learn_alike(
     (verdict,) = verdicts(board(sft=matrix(0.1), lora=matrix(1.0, 0.3), finch=matrix(0.2)))
     assert verdict.leader.method == "lora"
     assert (
-        "It learns less than sft: 0.30 against 1.00. Of the methods not told apart from sft in what "
-        "they learn, finch keeps the most (0.20)" in verdict.keeping
+        "It learns less than sft: 0.30 against 1.00. Among the methods whose learning is not told apart from "
+        "sft's, finch keeps the most (0.20)" in verdict.keeping
     )
 
 
@@ -208,12 +217,12 @@ def test_the_only_method_of_a_division_is_compared_with_plain_fine_tuning(board:
     rows = board(sft=matrix(0.1), replay=matrix(0.9))
     assert [verdict.name for verdict in verdicts(rows)] == ["prior-data-free", "prior demonstrations"]
     assert verdicts(rows)[1].keeping == (
-        "It learns 1.00 (sft 1.00) and keeps 0.90 (sft 0.10); only the difference in what is kept is told "
-        "apart. Its training time was not measured."
+        "It learns 1.00 (sft 1.00) and keeps 0.90 (sft 0.10); it is told apart from sft only in what it "
+        "keeps. Its training time was not measured."
     )
     alike = verdicts(board(sft=matrix(0.1), replay=matrix(0.1)))[1]
     assert alike.keeping.startswith(
-        "It learns 1.00 (sft 1.00) and keeps 0.10 (sft 0.10); neither difference is told apart."
+        "It learns 1.00 (sft 1.00) and keeps 0.10 (sft 0.10); it is told apart from sft in neither."
     )
 
 
@@ -234,13 +243,14 @@ def test_with_one_seed_nothing_is_told_apart(board: Callable[..., Any]) -> None:
         for row in board(sft=matrix(0.5), lora=matrix(0.4), replay=matrix(0.6))
     ]
     assert headline(rows) == (
-        "One seed: no method can be told apart from plain fine-tuning. The intervals cover episodes alone."
+        "With one seed, no method can be told apart from plain fine-tuning: the intervals cover only the "
+        "noise of episodes."
     )
     assert verdicts(rows)[1].keeping == (
-        "It learns 1.00 (sft 1.00) and keeps 0.60 (sft 0.50), with one seed alone. Its training time was not "
+        "It learns 1.00 (sft 1.00) and keeps 0.60 (sft 0.50), with only one seed. Its training time was not "
         "measured."
     )
-    assert headline(rows[:2]).startswith("One seed: the one other method cannot be told apart")
+    assert headline(rows[:2]).startswith("With one seed, the only other method cannot be told apart")
 
 
 def test_a_gain_that_is_not_certain_over_a_tied_setting_is_not_in_the_headline(
@@ -259,8 +269,8 @@ def test_a_card_says_why_the_gain_of_its_leader_is_not_certain(board: Callable[.
     assert verdicts(rows)[0].doubt == ""
     tied = {"lora": (TiedGain(0.1, Estimate(0.01, -0.01, 0.03), 4),)}
     assert verdicts(rows, tied)[0].doubt == (
-        "Tuning rated sft as highly at 0.1 times the scenario's learning rate; over that setting, the gain "
-        "is +0.01 [-0.01, +0.03] and not certain."
+        "Tuning rated sft equally highly at 0.1 times the scenario's learning rate. Over that setting, the "
+        "gain is +0.01 [-0.01, +0.03], which is not certain."
     )
     tied = {"lora": (TiedGain(0.1, Estimate(None, None, None), 0),)}
     assert verdicts(rows, tied)[0].doubt == (
@@ -274,6 +284,6 @@ def test_a_card_says_why_the_gain_of_its_leader_is_not_certain(board: Callable[.
     rows = [dataclasses.replace(leader, estimates=estimates), *alike[1:]]
     (verdict,) = verdicts(rows)
     assert verdict.doubt == (
-        "Its gain is above 0 by its own interval alone, but not told apart from 0 when all 2 methods "
+        "Its own interval puts its gain above 0, but the gain is not told apart from 0 when all 2 methods "
         "without prior demonstrations are compared with sft."
     )

@@ -127,8 +127,8 @@ def test_the_focus_goes_to_the_table_where_an_address_opened_a_row(open_page: Ca
 def test_filters_that_no_method_passes_say_so(open_page: Callable[[str], Page]) -> None:
     page = open_page("")
     note, filtered = page.locator("[data-plane-note]"), page.get_by_label("Method", exact=True)
-    page.get_by_label("Across").select_option("relative cost")
-    expect(note).to_contain_text("Not in the picture: ")
+    page.get_by_label("Horizontal axis").select_option("relative cost")
+    expect(note).to_contain_text("Not in the chart: ")
     filtered.fill("lora")
     expect(note).to_contain_text("lora (")
     expect(note).not_to_contain_text("finch")
@@ -169,7 +169,7 @@ def chosen(page: Page) -> dict[str, str]:
     head = part.locator(".board thead th:not([aria-sort=none])")
     title = head.locator("button").inner_text().partition(" lower")[0].strip()
     return {
-        "across": part.get_by_label("Across").input_value(),
+        "across": part.get_by_label("Horizontal axis").input_value(),
         "text": part.get_by_label("Method", exact=True).input_value(),
         "all": str(part.get_by_label("all columns").is_checked()),
         "sorted": f"{title} {head.get_attribute('aria-sort')}",
@@ -183,7 +183,7 @@ def test_choices_survive_a_reload_and_the_way_back_and_a_link_hands_them_on(
     page = open_page("")
     part = page.locator(".part:not([hidden])")
     usual = chosen(page)
-    part.get_by_label("Across").select_option("bytes kept")
+    part.get_by_label("Horizontal axis").select_option("bytes kept")
     part.get_by_label("Method", exact=True).fill("f")
     part.get_by_label("all columns").check()
     part.locator(".board thead button", has_text="learned").click()
@@ -215,7 +215,7 @@ def test_a_link_with_choices_holds_in_a_page_that_is_open(open_page: Callable[[s
     page.evaluate(
         "(hash) => { location.hash = hash; }", f"{EVEN}?across=bytes+kept&sort=learned&order=ascending"
     )
-    expect(page.locator(".part:not([hidden])").get_by_label("Across")).to_have_value("bytes kept")
+    expect(page.locator(".part:not([hidden])").get_by_label("Horizontal axis")).to_have_value("bytes kept")
     mine = chosen(page)
     assert mine["sorted"] == "learned ascending"
     assert "sort=learned" in page.url

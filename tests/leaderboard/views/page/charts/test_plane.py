@@ -52,7 +52,7 @@ def test_more_success_is_further_right(rows: Any) -> None:
 def test_a_row_outside_the_plane_is_named_with_its_values(rows: Any) -> None:
     plane = Plane(rows, learned, kept)
     assert [point["method"] for point in plane.points] == ["sft", "heavy"]
-    assert plane.note.startswith("Not in the picture: frozen (learned 0.00 [")
+    assert plane.note.startswith("Not in the chart: frozen (learned 0.00 [")
     picture = resolve(f"{PLANE}:plane")(rows, resolve(f"{PLANE}:WIDE"))
     assert Plane(rows, learned, skills).note in " ".join(picture["title"]["subtitle"])
 
