@@ -213,6 +213,8 @@ def _claims(judged: Sequence[Judged]) -> Section:
             f"{paper}: {tally(one.finding.verdict for one in counted_ones)}."
             f"{_those_that_hold(counted_ones)}{_uncounted(every)}"
         )
+    if any(one.claim.scenarios == KNOWLEDGE for one in judged):
+        answers.insert(0, HOW_IT_WAS_MADE)
     boards = tuple(dict.fromkeys(one.evidence.scenario for one in judged))
     found = grouped((one.claim, one) for one in judged)
     lines = tuple(_claim_line(claim, members, boards) for claim, members in found.items())
@@ -276,9 +278,11 @@ def _what_would_show_it(judged: Sequence[Judged]) -> list[str]:
     ]
 
 
-MADE_FOR_IT = (
-    "the one scenario that was made to show it, with large steps and training that goes on long after the "
-    "target is learned"
+MADE_FOR_IT = "the one scenario that was made to show it"
+
+HOW_IT_WAS_MADE = (
+    "clbench/FetchKnowledge-v1 was made to show claims on knowledge: its steps are large, and training goes "
+    "on long after the target is learned."
 )
 
 

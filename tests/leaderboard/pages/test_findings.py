@@ -216,11 +216,9 @@ def test_a_claim_is_a_line_with_a_verdict_for_each_board_what_explains_it_and_wh
     assert "Half are 0" not in section
     assert "Nothing explains it" not in section
     assert "- What would show C2 and C7 on c: longer stages.\n" in section
-    conditions = (
-        "the one scenario that was made to show it, with large steps and training that goes on long after "
-        "the target is learned"
-    )
-    assert f"- A4 on d, {conditions}: It keeps none.\n" in section
+    assert "- A4 on d, the one scenario that was made to show it: It keeps none.\n" in section
+    assert "- clbench/FetchKnowledge-v1 was made to show claims on knowledge: its steps are large" in section
+    assert ", and training goes on long after the target is learned.\n" in section
     assert "- ConSFT: of 3 verdicts, 2 do not hold and 1 cannot be shown here. C7 is our reading" in section
     assert "is our reading of the paper and is not counted: of 2 verdicts, 1 is undecided" in section
     assert "| id | claim | measured quantity | a | b | c | d |\n" in section
