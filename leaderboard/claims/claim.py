@@ -127,14 +127,10 @@ def claim(
 
 
 def tally(verdicts: Iterable[Verdict]) -> str:
-    """Return how often each verdict was given: "of 3 verdicts, 1 holds and 2 are undecided"."""
+    """Return how often each verdict was given: '3 verdicts: 1 "holds" and 2 "undecided"'."""
     counts = Counter(verdicts)
-    parts = [
-        f"{counts[verdict]} {one if counts[verdict] == 1 else several}"
-        for verdict, (one, several) in PREDICATES.items()
-        if counts[verdict]
-    ]
-    return f"of {counted(counts.total(), 'verdict')}, {listed(parts)}"
+    parts = [f'{counts[verdict]} "{verdict}"' for verdict in PREDICATES if counts[verdict]]
+    return f"{counted(counts.total(), 'verdict')}: {listed(parts)}"
 
 
 def decided(*, holds: bool, fails: bool, in_part: bool = False) -> Verdict:

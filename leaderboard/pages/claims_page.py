@@ -43,7 +43,7 @@ def _tally(judged: Sequence[Judged]) -> list[str]:
     for scenario in dict.fromkeys(one.evidence.scenario for one in judged):
         here = [one for one in judged if one.evidence.scenario == scenario]
         verdicts = tally(one.finding.verdict for one in here)
-        sentences.append(f"{scenario}: {verdicts}. {_corrected(here)}".rstrip())
+        sentences.append(f"{scenario} has {verdicts}. {_corrected(here)}".rstrip())
     return sentences
 
 

@@ -210,7 +210,7 @@ def _claims(judged: Sequence[Judged]) -> Section:
     for paper, every in grouped((one.claim.paper.name, one) for one in judged).items():
         counted_ones = [one for one in every if not one.claim.uncounted]
         answers.append(
-            f"{paper}: {tally(one.finding.verdict for one in counted_ones)}."
+            f"{paper} has {tally(one.finding.verdict for one in counted_ones)}."
             f"{_those_that_hold(counted_ones)}{_uncounted(every)}"
         )
     if any(one.claim.scenarios == KNOWLEDGE for one in judged):
@@ -306,7 +306,7 @@ def _uncounted(judged: Sequence[Judged]) -> str:
     """Return in a sentence which claims are not counted, and why."""
     found = grouped((one.claim, one.finding.verdict) for one in judged if one.claim.uncounted)
     return "".join(
-        f" {claim.id} is {claim.uncounted} and is not counted: {tally(verdicts)}."
+        f" {claim.id} is {claim.uncounted} and is not counted; it has {tally(verdicts)}."
         for claim, verdicts in found.items()
     )
 

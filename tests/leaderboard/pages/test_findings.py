@@ -173,7 +173,7 @@ def test_claims_that_hold_are_named_since_some_are_about_plain_fine_tuning(
     monkeypatch.setattr("clbench.leaderboard.claims.judges.judge_all", lambda *_: every)
     fill(even_board, sft=0.4)
     words = "C1, Unconstrained fine-tuning degrades pretrained skills (on 1 of 2 boards)."
-    assert f"of 2 verdicts, 1 holds and 1 is undecided. What holds: {words}" in page()
+    assert f'ConSFT has 2 verdicts: 1 "holds" and 1 "undecided". What holds: {words}' in page()
 
 
 def test_the_page_begins_with_the_number_of_claims_by_their_best_verdicts(
@@ -194,7 +194,7 @@ def test_a_claim_that_is_algebra_is_not_counted_with_those_that_records_judge(
 ) -> None:
     fill(even_board, sft=0.4)
     text = page()
-    assert "C5 is algebra and is not counted: of 1 verdict, 1 holds." in text
+    assert 'C5 is algebra and is not counted; it has 1 verdict: 1 "holds".' in text
     assert "What holds: C5" not in text
 
 
@@ -219,8 +219,11 @@ def test_a_claim_is_a_line_with_a_verdict_for_each_board_what_explains_it_and_wh
     assert "- A4 on d, the one scenario that was made to show it: It keeps none.\n" in section
     assert "- clbench/FetchKnowledge-v1 was made to show claims on knowledge: its steps are large" in section
     assert ", and training goes on long after the target is learned.\n" in section
-    assert "- ConSFT: of 3 verdicts, 2 do not hold and 1 cannot be shown here. C7 is our reading" in section
-    assert "is our reading of the paper and is not counted: of 2 verdicts, 1 is undecided" in section
+    assert (
+        '- ConSFT has 3 verdicts: 2 "does not hold" and 1 "cannot be shown here". C7 is our reading'
+        in section
+    )
+    assert 'is our reading of the paper and is not counted; it has 2 verdicts: 1 "undecided"' in section
     assert "| id | claim | measured quantity | a | b | c | d |\n" in section
     value, none = "0.25 [0.12, 0.50]", "cannot be shown here"
     cells = f"kept | does not hold: {value} | does not hold: {value} | {none}: {value} |  |"
@@ -305,7 +308,7 @@ def test_definitions_that_order_the_methods_alike_have_a_tau_of_one(
     # every seed is the same: the method explains all
     assert (
         "the method explains 100% of the variance of the final average, and the seed with its order of the "
-        "targets 0% (omega squared; 4 methods without prior demonstrations, 4 seeds)."
+        "targets 0% (omega squared; 5 methods without prior demonstrations, 4 seeds)."
     ) in text
 
 
