@@ -308,7 +308,7 @@ def test_definitions_that_order_the_methods_alike_have_a_tau_of_one(
     # every seed is the same: the method explains all
     assert (
         "the method explains 100% of the variance of the final average, and the seed with its order of the "
-        "targets 0% (omega squared; 5 methods without prior demonstrations, 4 seeds)."
+        "targets 0% (omega squared; 6 methods without prior demonstrations, 4 seeds)."
     ) in text
 
 

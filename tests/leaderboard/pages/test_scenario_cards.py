@@ -402,7 +402,7 @@ def test_a_scenario_with_a_criterion_has_bars_and_orders_of_its_own(
     assert "Latin square" in part(card.page(), "Order of the targets")
     assert "<br>in test episodes:<br>a wording of the test |" in part(card.page(), "Tasks")
     assert (
-        "Pretraining also has these tasks, which no score counts and no method trains on again: practised."
-        in part(card.page(), "Tasks")
+        "The policy is also pretrained on these tasks, which count in no score and which no method trains on "
+        "again: practised." in part(card.page(), "Tasks")
     )
     assert "The policy is evaluated at the end of each stage." in part(card.page(), "Budget")
