@@ -1,4 +1,4 @@
-"""The cache: a slow result is made once, and used again if it is whole and made from the same inputs."""
+"""The cache of slow results: each is made once, and reused while it is whole and its inputs are the same."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 LOG = logging.getLogger("clbench")
 
 MANIFEST = "clbench.json"
-"""File of an entry that lists its inputs, and its other files with their hashes."""
+"""File in each entry that lists the entry's inputs, and its other files with their hashes."""
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE)
-"""Errors of a machine that has no room for a file, or none for an open one."""
+"""Error numbers of a machine that has no room for a file, or that cannot keep another file open."""
 
 FAILING = (
     errno.EIO,
@@ -43,7 +43,7 @@ FAILING = (
     errno.EHOSTDOWN,
     errno.EHOSTUNREACH,
 )
-"""Errors of a disk, or of the network to a shared folder."""
+"""Error numbers of a failing disk, or of a failing network to a shared folder."""
 
 
 class CacheError(ClbenchError, OSError):
@@ -51,7 +51,7 @@ class CacheError(ClbenchError, OSError):
 
 
 def cache_folder() -> Path:
-    """Return the folder of the cache: `CLBENCH_CACHE`, or clbench below the user's own cache folder."""
+    """Return the cache folder: `CLBENCH_CACHE` if it is set, else clbench in the user's own cache folder."""
     if os.environ.get("CLBENCH_CACHE"):
         return Path(os.path.realpath(Path(os.environ["CLBENCH_CACHE"]).expanduser()))
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser().absolute() / "clbench"
@@ -83,7 +83,7 @@ def cached(folder: Path, inputs: Mapping[str, Any], make: Callable[[Path], None]
 
     Args:
         folder: Folder of the result.
-        inputs: All that the result depends on, as JSON.
+        inputs: Everything that the result depends on, as JSON.
         make: Fills an empty folder.
 
     Raises:
@@ -111,7 +111,7 @@ def _remove_unfinished(folder: Path) -> None:
 
 
 def _make(folder: Path, manifest: Mapping[str, Any], make: Callable[[Path], None], lease: Lease) -> None:
-    """Fill `folder` in one step; what is there is removed."""
+    """Make `folder` in one step; an earlier one is removed."""
     partial = unfinished(folder)
     partial.mkdir()
     try:
@@ -129,10 +129,13 @@ def _make(folder: Path, manifest: Mapping[str, Any], make: Callable[[Path], None
 
 @contextmanager
 def _explained(folder: Path) -> Iterator[None]:
-    """Name what cannot be kept if the file system fails inside; files elsewhere are for `make` to handle."""
+    """Raise a `CacheError` that names `folder` if the file system fails inside the block.
+
+    Errors about files elsewhere pass unchanged: `make` must handle them.
+    """
     try:
         yield
-    except CacheError:  # of another result, which `make` needs
+    except CacheError:  # about another result, which `make` needs
         raise
     except (OSError, SafetensorError) as error:
         if isinstance(error, OSError) and not is_the_machines(error) and not _is_on_the_way(error, folder):
@@ -147,7 +150,7 @@ def is_the_machines(error: OSError) -> bool:
 
 
 def _is_on_the_way(error: OSError, folder: Path) -> bool:
-    """Return whether the file of an error is below the parent of `folder`, or a folder above it."""
+    """Return whether an error concerns a path below the parent of `folder`, or a folder above that parent."""
     if error.filename is None:
         return False
     path, parent = (Path(os.path.abspath(os.fsdecode(name))) for name in (error.filename, folder.parent))
@@ -176,7 +179,7 @@ def _fault(folder: Path, key: str) -> str | None:
     """Return the fault of `folder`, or None.
 
     Raises:
-        CacheError: The file system refuses to read: what is there may be whole, and stays.
+        CacheError: The file system refuses to read. The entry may be whole, so it stays.
     """
     try:
         manifest = read_json(folder / MANIFEST)
@@ -198,5 +201,5 @@ def _file_hashes(folder: Path) -> dict[str, str]:
 
 
 def _file_hash(path: Path) -> str:
-    with path.open("rb") as file:  # in pieces: a policy may be larger than the memory that is left
+    with path.open("rb") as file:  # in pieces: a policy may be larger than the free memory
         return hashlib.file_digest(file, "sha256").hexdigest()

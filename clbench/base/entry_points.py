@@ -1,4 +1,4 @@
-"""Entry points: objects by their names "module:attribute"."""
+"""Entry points: objects that are found by a name of the form "module:attribute"."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ def resolve(name: str) -> Any:
 
 
 def import_module(module: str, needed_for: str) -> Any:
-    """Return a module.
+    """Import a module and return it.
 
     Args:
         module: Name of the module.
-        needed_for: Name of the thing that needs it, for the message.
+        needed_for: Name of what needs the module, for the message.
 
     Raises:
         UnknownNameError: The module, or a module that it imports, does not exist.
@@ -71,7 +71,7 @@ def import_module(module: str, needed_for: str) -> Any:
 
 
 def _hint_of_folder(name: str) -> str:
-    """Return the end of a message: the module of the working directory nearest to `name`, or that none is."""
+    """Return the end of a message: the nearest module in the working directory, or that there is none."""
     folder = os.getcwd()
     if not {"", folder} & set(sys.path):  # such as in a script of another folder
         return ""
@@ -80,7 +80,7 @@ def _hint_of_folder(name: str) -> str:
 
 
 def class_hint(name: str) -> str:
-    """Return the end of a message for a file, a module or a dotted name where "module:Class" belongs."""
+    """Return the end of a message about a file, a module or a dotted name in place of "module:Class"."""
     stem = name.removesuffix(".py").removeprefix("./").replace("/", ".")
     module, _, attribute = stem.rpartition(".")
     if not is_module(stem):

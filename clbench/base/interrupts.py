@@ -1,9 +1,9 @@
-"""Ctrl-C, and other signals that stop a command, which cannot get lost.
+"""Ctrl-C and the other signals that stop a command: none of them can get lost.
 
 Python raises KeyboardInterrupt wherever the main thread happens to be. In a destructor or a callback the
-exception is printed and dropped, and a library may swallow it. The handler therefore also remembers it: long
-work calls `check`. A compiled module that meets the exception while it loads may abort the process, so the
-handler lets imports finish first.
+exception is printed and dropped, and a library may swallow it. The handler therefore also remembers the
+signal, and long-running code calls `check`. A compiled module that meets the exception while it loads may
+abort the process, so the handler lets imports finish first.
 """
 
 from __future__ import annotations
@@ -22,14 +22,17 @@ _first: tuple[int, float] | None = None
 _AGAIN_SECONDS = 0.01
 
 _IMPORT_SECONDS = 10.0
-"""PyTorch is imported in 1 s, on a busy machine in several. One that never ends must not block Ctrl-C."""
+"""Longest wait for an import, in seconds. PyTorch takes 1 s, or several on a busy machine; an import that
+never ends must not block Ctrl-C."""
 
 
 def install(numbers: Iterable[int] = (signal.SIGINT,)) -> None:
-    """Let signals raise KeyboardInterrupt, again if a destructor or a callback dropped it, and remember them.
+    """Make signals raise KeyboardInterrupt, and raise it again if a destructor or a callback dropped it.
+
+    The first signal is remembered for `stopped_by` and `check`.
 
     Args:
-        numbers: The signals.
+        numbers: Numbers of the signals.
     """
     global _first
     _first = None  # an earlier command in this process may have been stopped
@@ -39,15 +42,15 @@ def install(numbers: Iterable[int] = (signal.SIGINT,)) -> None:
 
 
 def stopped_by() -> int | None:
-    """Return the number of the signal that came first, None if none came."""
+    """Return the number of the first signal, None if there was none."""
     return None if _first is None else _first[0]
 
 
 def check() -> None:
-    """Raise the Ctrl-C, or what another signal raised, that came earlier, if it got lost.
+    """Raise KeyboardInterrupt if a signal came earlier, in case the first exception got lost.
 
     Raises:
-        KeyboardInterrupt: There was one.
+        KeyboardInterrupt: A signal has come since `install`.
     """
     if _first is not None:
         raise KeyboardInterrupt
@@ -65,7 +68,7 @@ def _handle(number: int, frame: FrameType | None) -> None:
 
 
 def _imports(frame: FrameType | None) -> bool:
-    """Return whether an import is under way in a frame or in those that called it."""
+    """Return whether a frame, or one of its callers, is importing a module."""
     while frame is not None:
         if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
             return True

@@ -25,10 +25,11 @@ SECONDS = 30.0
 noticed at once on its own machine."""
 
 _REMOVAL = 1.5
-"""Times `SECONDS` after which a file that filelock leaves is removed: filelock comes first where it can."""
+"""Multiple of `SECONDS` after which a file that filelock leaves behind is removed. It is above 1, so that
+filelock comes first where it can."""
 
 REPORT_SECONDS = 5.0
-"""Least time between two reports of progress, in seconds."""
+"""Minimum time between two progress reports, in seconds."""
 
 
 class LeaseLostError(ClbenchError, RuntimeError):
@@ -39,7 +40,7 @@ class Owner(NamedTuple):
     """The process that holds a lease."""
 
     process: int
-    """Its number; 0 if its name has not reached this machine."""
+    """Number of the process; 0 if its name has not reached this machine."""
     host: str
 
     def __str__(self) -> str:
@@ -47,7 +48,7 @@ class Owner(NamedTuple):
 
 
 class Report(NamedTuple):
-    """How far the owner of a lease is."""
+    """Progress that the owner of a lease reports."""
 
     share: float
     """Share of the work that is done, from 0 to 1."""
@@ -63,18 +64,18 @@ def lease_path(path: Path) -> Path:
 class Lease:
     """The right of one process to make a file or folder.
 
-    A heartbeat keeps it. If the owner dies, another process takes it over: at once on the same machine, and
-    after `SECONDS` on another one that watches it meanwhile. Where filelock cannot do this, any process that
-    watches takes it over after 1.5 times `SECONDS`.
+    A heartbeat keeps the lease. If the owner dies, another process takes the lease over: at once on the same
+    machine, and after `SECONDS` on another machine that has watched it meanwhile. Where filelock cannot do
+    this, any process that watches the lease takes it over after 1.5 times `SECONDS`.
 
     Args:
-        path: What is made. The file of the lease lies beside it.
+        path: File or folder to make. The file of the lease lies beside it.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._file = lease_path(path)
-        # the file is gone before it is closed: an error then says nothing of the lease
+        # the file is gone before it is closed: an error on closing then says nothing about the lease
         self._lock = SoftFileLease(self._file, lease_duration=SECONDS, close_error_policy="suppress")
         self._begin = self._reported = 0.0
         self._seen: tuple[int, int, bytes] | None = None
@@ -96,10 +97,10 @@ class Lease:
     def _removes_dead(self) -> bool:
         """Remove the file of a dead owner, which filelock leaves in two cases, and return whether it is gone.
 
-        filelock exchanges two names in one step, which NFS and Lustre refuse. And it never removes an empty
-        file, which a machine leaves that stops before the content is on the disk. Here the file is renamed
-        and looked at again. If it is the lease of a new owner by then, it goes back. That owner may miss it
-        for a moment; then `check` stops its work, and no two owners write.
+        filelock exchanges two names in one step, which NFS and Lustre refuse. It also never removes an empty
+        file, which a machine leaves if it stops before the content is on the disk. Here the file is renamed
+        and read again. If it is the lease of a new owner by then, it is put back. That owner may miss it for
+        a moment; then `check` stops its work, and no two owners write.
         """
         aside = self._file.with_name(f".{self._path.name}.{uuid.uuid4().hex}.lease")
         try:
@@ -120,14 +121,14 @@ class Lease:
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """Wait for the lease, say for whom now and then, and hold it inside."""
+        """Wait for the lease, report now and then who holds it, and hold it inside the block."""
         begin, told = time.monotonic(), -SECONDS
         while not self.take():
             waited = time.monotonic() - begin
             if waited - told >= SECONDS:
                 told = waited
                 remark(f"waiting for {self._holder() or 'another process'} to make {self._path}")
-            time.sleep(0.1 if waited < 1 else 1.0)  # a moment first, then seldom: a file server answers all
+            time.sleep(0.1 if waited < 1 else 1.0)  # short waits, then long ones: a file server serves all
         try:
             if told >= 0:
                 remark("")
@@ -147,15 +148,15 @@ class Lease:
             )
 
     def _is_lost(self) -> bool:
-        """Return whether another process has the lease; the heartbeat alone notices it up to 20 s late."""
+        """Return whether another process has the lease; the heartbeat alone would notice up to 20 s late."""
         if self._lock.compromise is not None:
             return True
         found = self._lock.owner
         if found is not None:
             return found.token != self._lock.token
         try:
-            return self._file.lstat().st_size == 0  # a new owner's, whose content has not arrived
-        except FileNotFoundError:  # whoever takes it over may be about to write its own
+            return self._file.lstat().st_size == 0  # the file of a new owner, whose content has not arrived
+        except FileNotFoundError:  # a new owner may be about to write its own file
             return True
         except OSError:  # the heartbeat decides whether the folder fails for too long
             return False
@@ -171,7 +172,7 @@ class Lease:
             _report_path(self._path).unlink(missing_ok=True)
 
     def report(self, share: float) -> None:
-        """Tell others how far the work is, every `REPORT_SECONDS` at most."""
+        """Tell other processes how far the work is, at most once every `REPORT_SECONDS`."""
         now = time.monotonic()
         if now - self._reported >= REPORT_SECONDS and not self._is_lost():
             self._reported = now
@@ -196,7 +197,7 @@ class Lease:
     def silence(self) -> float:
         """Seconds since the last heartbeat of an owner, infinite without a lease.
 
-        The time is that of the file server, as far as it tells: the clock of this machine may be wrong.
+        The clock is that of the file server where it can be read: the clock of this machine may be wrong.
         """
         try:
             changed = self._file.stat().st_mtime
@@ -206,14 +207,14 @@ class Lease:
 
     @property
     def owner(self) -> Owner | None:
-        """The process that holds the lease, None if none does. The lease of a dead process goes.
+        """The process that holds the lease, None if none does. The lease of a dead process is removed.
 
-        A process of another machine counts for twice `SECONDS` after its last heartbeat.
+        A process on another machine counts as alive for twice `SECONDS` after its last heartbeat.
         """
         return None if self.clear() else self._holder()
 
     def _holder(self) -> Owner | None:
-        """Return the process that the file names, if it gave a sign of life."""
+        """Return the process that the file names, None if its last heartbeat is too old."""
         if self.silence >= 2 * SECONDS:
             return None
         found = self._lock.owner
@@ -239,7 +240,7 @@ def _report_path(path: Path) -> Path:
 
 
 def _look(file: Path) -> tuple[int, int, bytes]:
-    """Return what a heartbeat or a new owner changes; NFS asks its server when a file is opened."""
+    """Return what a heartbeat or a new owner changes; the file is opened, so that NFS asks its server."""
     descriptor = os.open(file, os.O_RDONLY | OPEN_PLAINLY)
     try:
         status = os.fstat(descriptor)
@@ -249,7 +250,7 @@ def _look(file: Path) -> tuple[int, int, bytes]:
 
 
 def now_in(folder: Path) -> float:
-    """Return the time of a folder's file server, or that of this machine where nothing can be written."""
+    """Return the time on a folder's file server, or on this machine where nothing can be written."""
     try:
         with tempfile.TemporaryFile(dir=folder, prefix=".") as file:
             return os.fstat(file.fileno()).st_mtime

@@ -19,23 +19,23 @@ import psutil
 from clbench.base.lease import Lease, now_in
 
 LEFT_SECONDS = 600.0
-"""Seconds without a sign of life after which another machine counts as gone. Clocks of machines may differ:
-by less than 300 s, or neither Slurm's nor Kerberos' messages would be accepted."""
+"""Seconds without a sign of life after which another machine counts as gone. Clocks of machines may differ,
+but by less than 300 s: otherwise neither Slurm nor Kerberos would accept their messages."""
 
 _MAKER = r"(?P<host>[0-9a-f]{8})(?P<process>[0-9a-f]{8})[0-9a-f]{16}"
 _UNFINISHED = re.compile(rf"\.(?P<name>.+)\.{_MAKER}\.(?:partial|old)")
 _LEASE = re.compile(r"\.(?P<name>.+)\.lease|\.(?P<record>seed-.+\.json)\.progress")
-"""Names of leases, and of the reports that the leases of records have."""
+"""Names of leases, and of the progress reports beside the leases of records."""
 
 
 def unfinished(path: Path) -> Path:
-    """Return a new path, beside `path`, at which this process can make it."""
+    """Return a new path beside `path`, at which this process can make the file or folder."""
     return path.with_name(f".{path.name}.{_host()}{os.getpid():08x}{uuid.uuid4().hex[:16]}.partial")
 
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a new path beside `path`: what is written there replaces `path` in one step, unless one fails."""
+    """Yield a new path beside `path`. If the block succeeds, the file there replaces `path` in one step."""
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     partial = unfinished(path)
@@ -48,19 +48,19 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @functools.cache
 def _host() -> str:
-    """Return a hash of what process numbers belong to: a machine, or a container on it."""
+    """Return a hash of the place in which process numbers are unique: a machine, or a container on it."""
     namespace = Path("/proc/self/ns/pid")
     place = f"{socket.gethostname()} {os.readlink(namespace) if namespace.is_symlink() else ''}"
     return hashlib.sha256(place.encode(errors="surrogateescape")).hexdigest()[:8]
 
 
 def is_unfinished(name: str) -> bool:
-    """Return whether a file or folder has the name of one that is being made or removed."""
+    """Return whether a name marks a file or folder as being made or removed."""
     return _UNFINISHED.fullmatch(name) is not None
 
 
 def finished_name(name: str) -> str:
-    """Return the name of what `name` becomes or was, for names of unfinished files and folders."""
+    """Return the final or former name of an unfinished file or folder; other names stay as they are."""
     found = _UNFINISHED.fullmatch(name)
     return name if found is None else found["name"]
 
@@ -68,7 +68,7 @@ def finished_name(name: str) -> str:
 def is_left_behind(path: Path) -> bool:
     """Return whether the process that was making or removing `path` is gone.
 
-    A process of this machine that lives may be stopped, and lose its lease: it still has what it was making.
+    A living process of this machine may be suspended and lose its lease. It still owns what it was making.
     """
     found = _UNFINISHED.fullmatch(path.name)
     made_here = found is not None and found["host"] == _host()
@@ -91,7 +91,7 @@ def is_idle(path: Path) -> bool:
 
 
 def sweep(*roots: Path) -> int:
-    """Remove what killed processes left below the folders, and return how much there was.
+    """Remove what killed processes left below the folders, and return the number of removed paths.
 
     What a living process is making stays, and so does everything that clbench does not make.
     """

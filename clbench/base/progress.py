@@ -18,7 +18,7 @@ _place = ""
 
 
 def listen(listener: Callable[[str, str], None] | None) -> None:
-    """Let `listener` hear every place that the work of this process reaches, and remarks; None ends that."""
+    """Call `listener` with every place that this process reaches, and with remarks; None stops the calls."""
     global _listener, _place
     _listener, _place = listener, ""
 
@@ -28,7 +28,7 @@ def announce(place: str, remark: str = "") -> None:
 
     Args:
         place: The hook or the stage.
-        remark: What to show beside it while it runs, such as the last success.
+        remark: Text to show beside the place while it runs, such as the last success.
     """
     global _place
     _place = place

@@ -1,4 +1,4 @@
-"""Seeds by name: every random stream follows from its purpose, never from the code that ran before."""
+"""Seeds by name: a random stream depends on its purpose alone, never on the code that ran before."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ def seeded(*parts: str | int) -> Iterator[None]:
 
 @contextmanager
 def draws_restored() -> Iterator[None]:
-    """Restore the global generators of Python, NumPy and PyTorch after the block: its draws come again."""
+    """Restore the global generators of Python, NumPy and PyTorch after the block, as if it drew nothing."""
     import torch
 
     python, numpy_state = random.getstate(), np.random.get_state()  # noqa: NPY002 - to restore it
-    # To read its generator would start a GPU that nobody has used: it has no draws to restore.
+    # Reading the generator would start a GPU that nothing has used. Such a GPU has no draws to restore.
     idle = torch.cuda.is_available() and not torch.cuda.is_initialized()  # type: ignore[no-untyped-call]
     with torch.random.fork_rng([] if idle else range(torch.accelerator.device_count())):
         try:
@@ -65,4 +65,5 @@ def draws_restored() -> Iterator[None]:
 
 
 SPLIT_LABELS = {"train": "train", "validation": "selection", "test": "report"}
-"""Names of the splits in seeds, older than the splits' own names: other words would draw other episodes."""
+"""Names of the splits in seeds. They are older than the names of the splits, and they stay: other words would
+draw other episodes."""

@@ -1,10 +1,11 @@
-"""Hashes of source code, which cache keys contain: a result is made again when the code that made it changes.
+"""Hashes of source code for cache keys: a result is made again when the code that made it changes.
 
-A key names packages, each with every package below it, and not single modules: a module that moves inside its
-package stays covered, and code that cannot change a result (the film maker, the command line) is not in the
-key. The code of users has no such order, so that what their modules import from beside them counts, too.
+A key covers whole packages, with every package below them, and not single modules. A module that moves inside
+its package therefore stays covered, and code that cannot change a result (the film maker, the command line)
+stays out of the key. The code of users has no such order, so the files beside their modules count too if the
+modules import them.
 
-Comments, docstrings and blank lines of Python files do not count: a better sentence makes nothing again.
+Comments, docstrings and blank lines of Python files do not count: editing them makes no result again.
 """
 
 from __future__ import annotations
@@ -35,10 +36,10 @@ RUN_SOURCES = (*TRAINING_SOURCES, "clbench.records", "clbench.evaluation", "clbe
 def source_hash(*modules: str) -> str:
     """Return the hash of the code of `modules`.
 
-    A package counts with all files below it but hidden ones, such as those of editors. Outside of clbench,
-    what a module imports from beside it counts, too, directly or through one another: files below the same
-    folder on Python's path or, if the module is installed, files of its own top-level package. Imports are
-    read, not run.
+    A package counts with all files below it, except for hidden ones such as those of editors. Outside of
+    clbench, the files beside a module that it imports count too, directly or through other imports: files
+    below the same folder on Python's path or, if the module is installed, files of its own top-level package.
+    Imports are read, not run.
 
     Args:
         modules: Names of modules and packages, in any order.
@@ -55,7 +56,7 @@ def source_hash(*modules: str) -> str:
             continue
         files = [origin]
         if origin.name == "__init__.py":
-            # Python and numba keep what they compile there, and would change the key in the middle of a run
+            # Python and numba keep compiled code in __pycache__, which would change the key during a run
             below = files_below(origin.parent)
             files = [one for one in below if one.parent.name != "__pycache__" and one.name[0] != "."]
         for path in [*files, *_imported_beside(module, origin, files)]:
@@ -68,7 +69,7 @@ def files_below(folder: Path) -> list[Path]:
     """Return the regular files below a folder, in order.
 
     Raises:
-        OSError: The file system refuses. `Path.rglob` leaves out what it cannot list, since Python 3.12.
+        OSError: The file system refuses. (Since Python 3.12, `Path.rglob` leaves out what it cannot list.)
     """
 
     def refuse(error: OSError) -> None:
@@ -88,14 +89,14 @@ def _is_regular(path: Path) -> bool:
 
 
 def _stamp(path: Path) -> tuple[int, int]:
-    """Return when a file was last changed, and its size."""
+    """Return the time of a file's last change, in nanoseconds, and its size, in bytes."""
     status = path.stat()
     return status.st_mtime_ns, status.st_size
 
 
 @functools.lru_cache(maxsize=4096)  # a run asks 20 times
 def _file_hash(path: Path, changed: int, size: int) -> bytes:
-    """Return the hash of a file that was last changed at a time and has a size."""
+    """Return the hash of a file; the time of its last change and its size tell versions of it apart."""
     content = path.read_bytes()
     return hashlib.sha256(_code(content) if path.suffix == ".py" else content).digest()
 
@@ -113,10 +114,10 @@ _REST = re.compile(r"[ \t\f]*(?:#|\n|\Z)")
 def _code(content: bytes) -> bytes:
     """Return a Python file without comments, docstrings and blank lines.
 
-    A docstring is any statement that is a string alone. The file is returned as it is if it cannot be read
-    this way for sure: it is no text, or a quotation mark or a brace has no partner, as in the strings inside
-    of formatted strings that Python 3.12 allows. Of 4,051 files of Python's library and six packages this
-    holds for 5; all others have the bytes that `tokenize` leads to, at a tenth of its time.
+    A docstring is any statement that is only a string. The file is returned as it is if it cannot be parsed
+    this way with certainty: it is not text, or a quotation mark or a brace has no partner, as in the strings
+    inside formatted strings that Python 3.12 allows. This is so for 5 of 4,051 files of Python's library and
+    six packages. For all others the bytes equal those from `tokenize`, in a tenth of the time.
     """
     try:
         text = content.decode().replace("\r\n", "\n")
@@ -197,7 +198,7 @@ def _file_below(folder: Path, module: str) -> Path | None:
 
 @functools.lru_cache(maxsize=4096)
 def _imports(path: Path, folder: Path, changed: int, size: int) -> tuple[str, ...]:
-    """Return the names in the imports of a file that may be modules, each with the packages that hold it."""
+    """Return the names in a file's imports that may be modules, each with the packages that contain it."""
     try:
         tree = ast.parse(path.read_bytes())
     except (SyntaxError, ValueError):  # nobody can import it either; its bytes count
@@ -220,7 +221,7 @@ def _imported_by(node: ast.AST, package: Sequence[str]) -> Iterator[list[str]]:
 def class_hash(cls: type) -> str:
     """Return the hash of the code and the plain values of a class that was typed at a prompt.
 
-    What its methods call outside of the class does not count.
+    Code outside the class that its methods call does not count.
     """
     digest = hashlib.sha256()
     for name, value in sorted(vars(cls).items()):
@@ -234,7 +235,7 @@ def class_hash(cls: type) -> str:
 
 
 def _code_text(code: CodeType) -> str:
-    """Return what a function does as text, without the numbers of its lines."""
+    """Return the bytecode, names and constants of a function as text, without its line numbers."""
 
     def text(constant: object) -> str:
         if isinstance(constant, CodeType):
@@ -246,16 +247,16 @@ def _code_text(code: CodeType) -> str:
 
 
 def names_in(code: CodeType) -> set[str]:
-    """Return the names of attributes and global variables that code uses, with the functions inside it.
+    """Return the names of attributes and global variables that code and the functions inside it use.
 
-    A comprehension is a function of its own in Python 3.11, and none in 3.12.
+    A comprehension is a function of its own in Python 3.11, but not in 3.12.
     """
     inside = (names_in(constant) for constant in code.co_consts if isinstance(constant, CodeType))
     return set(code.co_names).union(*inside)
 
 
 def has_source(module: str) -> bool:
-    """Return whether a module has a file; the module of a prompt has none."""
+    """Return whether a module has a file; the module of an interactive prompt has none."""
     return _origin(module) is not None
 
 

@@ -26,7 +26,7 @@ LONGEST_NAME = 200
 """Length limit of the name of an entry in characters."""
 
 LARGEST = 2**64
-"""Bound of whole numbers: their absolute value is smaller. Seeds have up to 64 bits."""
+"""Bound on whole numbers: their absolute value must be below it. Seeds have up to 64 bits."""
 
 _SCALARS = {str, int, float, bool, type(None)}
 
@@ -39,10 +39,10 @@ class StrictJSONError(ClbenchError, ValueError):
 
 
 def refusal(error: Exception) -> OSError | None:
-    """Return the error of a file system that cannot read now what may be sound, None for any other error.
+    """Return the file system's error if the file may be sound but cannot be read now, None otherwise.
 
     Args:
-        error: Such an error, or one that it caused, as `read_json` raises it.
+        error: Error of the file system, or an error that it caused, such as the one that `read_json` raises.
     """
     found = error if isinstance(error, OSError) else error.__cause__
     nothing = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
@@ -53,8 +53,8 @@ def read_json(path: Path) -> Any:
     """Return the JSON in the regular file at `path`.
 
     Raises:
-        StrictJSONError: It is not a regular file, too large, not UTF-8 or not JSON; a name occurs twice in
-            one object; or a value is nested too deep, too long, too large or not finite.
+        StrictJSONError: The file is not regular, too large, not UTF-8 or not JSON; a name occurs twice in one
+            object; or a value is nested too deep, too long, too large or not finite.
     """
     try:
         content = read_regular(path)
@@ -72,7 +72,7 @@ def read_regular(path: Path) -> bytes:
     """Return the content of the regular file at `path`.
 
     Raises:
-        StrictJSONError: It is a link, no regular file or too large.
+        StrictJSONError: The file is a link, not regular, or too large.
         OSError: The file system refuses to read it.
     """
     if path.is_symlink():
@@ -95,7 +95,7 @@ def _no_number(name: str) -> Any:
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Refuse a name that occurs twice: readers would differ in the one that they keep."""
+    """Refuse a name that occurs twice: readers differ in which of the values they keep."""
     values = dict(pairs)
     if len(values) != len(pairs):
         ((name, _),) = Counter(name for name, _ in pairs).most_common(1)

@@ -37,12 +37,12 @@ def printable_lines(text: str) -> str:
 
 
 def shortened(text: str, whole: str) -> str:
-    """Return a text of at most `LONGEST_SHOWN` characters, or its beginning and where the whole text is."""
+    """Return a text as it is, or if longer than `LONGEST_SHOWN` its beginning and where the whole text is."""
     return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]} [... {whole} has the rest]"
 
 
 def counted(count: int, noun: str, nouns: str = "") -> str:
-    """Return a number of things: "1 seed", "2 seeds"; `nouns` is the plural if it is not `noun` with an s."""
+    """Return a count with its noun, "1 seed" or "2 seeds"; `nouns` is the plural if not `noun` with an s."""
     return f"{count} {noun if count == 1 else nouns or f'{noun}s'}"
 
 
@@ -57,22 +57,22 @@ def print_plain(console: Console, text: str, style: str | None = None) -> None:
 
 
 def listed(parts: Iterable[str]) -> str:
-    """Return the parts of a sentence in a row: "a", "a and b", "a, b and c"."""
+    """Return the parts joined as in a sentence: "a", "a and b", "a, b and c"."""
     *first, last = list(parts) or [""]
     return " and ".join([*filter(None, [", ".join(first)]), last])
 
 
 def clock_time(seconds: float) -> str:
-    """Return a duration as minutes and seconds, "2:05", from an hour on with hours: "1:02:05"."""
+    """Return a duration in minutes and seconds, such as "2:05", or from one hour on as "1:02:05"."""
     minutes, seconds = divmod(int(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return the end of a message with the known name that is nearest, empty if none is near.
+    """Return the end of a message with the nearest known name, empty if none is near.
 
-    Small and capital letters are the same, and a name with a namespace is near to its last part.
+    Case does not count, and a name with a namespace can also be found by its last part.
     """
     names: dict[str, str] = {}
     for one in known:
@@ -83,7 +83,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 
 def html_table(title: str, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
-    """Return a title and a table as HTML, all texts escaped; a tuple in a cell gets a line for each item."""
+    """Return a title and a table as HTML; texts are escaped, and a tuple in a cell takes a line per item."""
 
     def cell(value: object) -> str:
         parts = value if isinstance(value, tuple) else (value,)
@@ -106,7 +106,7 @@ def field_docstrings(cls: type) -> dict[str, str]:
 
 
 def with_fields(cls: type[T]) -> type[T]:
-    """Return a class after its fields, with their docstrings, were added to its docstring, for `help`."""
+    """Add the fields of a class, with their docstrings, to its docstring for `help`, and return the class."""
     own = cls.__dict__.get("__doc__") or ""
     if _HEADING not in own and (fields := field_docstrings(cls)):
         lines = [f"    {name}: {text}" for name, text in fields.items()]

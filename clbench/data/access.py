@@ -1,8 +1,8 @@
 """Access rules: the data that the hooks of a stage must not see. Every run checks them.
 
 The hooks of a method may use the objects that the runner passes to them, and no data of a later stage. They
-may read the demonstrations of their own target, and of earlier tasks if `uses` declares it, and run the
-validation episodes of the same tasks: a policy that still knows a task makes demonstrations of it by playing.
+may read the demonstrations of their own target, and of earlier tasks if `uses` declares it. They may run the
+validation episodes of the same tasks: a policy that still knows a task can make demonstrations by playing it.
 They may run no test episode and ask no test question. After `prepare`, each stage and `load_state`, the
 policy must still have the normalisation of the retained skills, its vocabulary and its sizes.
 
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 
 
 class _Rights(NamedTuple):
-    """What the running hooks may use."""
+    """Tasks whose data the running hooks may use."""
 
     known: frozenset[str]
-    """Names of the tasks that they may know."""
+    """Names of the tasks that the hooks may know."""
     readable: frozenset[str]
-    """Names of those whose demonstrations they may read and whose episodes they may run."""
+    """Names of the tasks whose demonstrations the hooks may read and whose episodes they may run."""
 
 
 _rights: ContextVar[_Rights | None] = ContextVar("rights", default=None)
@@ -52,20 +52,20 @@ class LeakError(ClbenchError, RuntimeError):
 
 
 class HookExitError(ClbenchError, RuntimeError):
-    """A hook tried to end the process, which is not a method's to end."""
+    """A hook tried to end the process, which no method may do."""
 
 
 @contextmanager
 def hooks(known: Iterable[str], readable: Iterable[str]) -> Iterator[None]:
-    """Restrict the code inside to the data of some tasks.
+    """Restrict the code inside the block to the data of some tasks.
 
     Args:
-        known: Names of the tasks that it may know.
-        readable: Names of those whose demonstrations it may read and whose episodes it may run.
+        known: Names of the tasks that the code may know.
+        readable: Names of the tasks whose demonstrations it may read and whose episodes it may run.
 
     Raises:
-        HookExitError: The code raises what is no `Exception`, such as `SystemExit`, or `KeyboardInterrupt`
-            where no Ctrl-C can have come.
+        HookExitError: The code raises something that is not an `Exception`, such as `SystemExit`, or raises
+            `KeyboardInterrupt` where no Ctrl-C can have come.
     """
     token = _rights.set(_Rights(frozenset(known), frozenset(readable)))
     try:
@@ -103,13 +103,13 @@ def check_demonstrations(task: str) -> None:
     """Refuse the demonstrations of a task that the running hooks must not read.
 
     Raises:
-        LeakError: The task comes after their stage, or the method does not declare that it reads them.
+        LeakError: The task comes after their stage, or `uses` of the method does not declare its data.
     """
     _check_task(task, "reads demonstrations")
 
 
 def check_episodes(episodes: Iterable[tuple[str, Split]]) -> None:
-    """Refuse to the running hooks all episodes but validation episodes of tasks that they may read.
+    """Refuse all episodes to the running hooks, except validation episodes of tasks that they may read.
 
     Args:
         episodes: Task and split of each episode.
@@ -144,7 +144,7 @@ def check_questions() -> None:
 
 
 def check_policy(policy: Policy, pretrained: Policy) -> None:
-    """Check that a policy still reads states and words as it was pretrained to.
+    """Check that a policy still reads states and words as it did in pretraining.
 
     Args:
         policy: Policy after a hook.

@@ -153,7 +153,7 @@ def _collect(world: World, task: Task, budget: Budget, progress: ProgressCallbac
 
 
 def dataset_id(task: Task, budget: Budget) -> str:
-    """Return the id of the task's Minari dataset. It has a hash of all that made the demonstrations.
+    """Return the id of the task's Minari dataset, with a hash of everything that made the demonstrations.
 
     Two versions of a task, or two budgets, therefore never share a folder.
     """
@@ -192,7 +192,7 @@ def dataset_folder(task: Task, budget: Budget, progress: ProgressCallback = no_p
 
 
 def keep_dataset(task: Task, budget: Budget, episodes: Callable[[World], Sequence[Demonstration]]) -> Path:
-    """Return the folder of the task's Minari dataset, which holds what `episodes` returned.
+    """Return the folder of the task's Minari dataset, which holds the result of `episodes`.
 
     Args:
         task: Task of the demonstrations.
@@ -262,7 +262,7 @@ def _write_dataset(
 
 
 def _env_spec(task: Task) -> EnvSpec:
-    """Return the environment of a task's dataset, which `recover_environment()` of the dataset makes."""
+    """Return the spec of the environment that `recover_environment()` of a task's dataset makes."""
     return EnvSpec(
         task.environment_id,
         entry_point="clbench.worlds.world:one_task",

@@ -46,7 +46,7 @@ def which(*truths: Truths) -> Answers:
 
 
 def sign(difference: NDArray[np.float32], margin: float) -> Answers:
-    """Return 0 where the difference (N,) is above the margin, 1 where it is below minus that, else -1."""
+    """Return 0 where the difference (N,) is above `margin`, 1 where it is below -`margin`, else -1."""
     return which(difference > margin, difference < -margin)
 
 
@@ -109,7 +109,7 @@ def _scenes(scenario: Scenario, progress: ProgressCallback) -> dict[str, Tensor]
 
 
 class Questions:
-    """Questions about a set of states: all kinds are equally frequent, and all answers within a kind.
+    """Questions about a set of states: all kinds are equally frequent, and so are all answers within a kind.
 
     Args:
         kinds: Kinds of questions to ask.
@@ -171,7 +171,7 @@ class Questions:
         return self.ask(torch.randint(len(self.kinds), (count,), generator=generator), generator)
 
     def ask(self, kind: Tensor, generator: torch.Generator) -> QuestionBatch:
-        """Return a question for each index (count,) of a kind."""
+        """Return one question for each entry of `kind`, the index of a kind, (count,)."""
         draws = torch.rand(3, len(kind), generator=generator)
         cell = self._first_cell[kind] + (draws[0] * self._answers[kind]).long()
         row = self._rows[self._cell_starts[cell] + (draws[1] * self._cell_sizes[cell]).long()]
@@ -198,6 +198,6 @@ def load_questions(scenario: Scenario) -> tuple[Questions, Questions]:
 
 
 def scored_questions(questions: Questions, count: int) -> tuple[Tensor, QuestionBatch]:
-    """Return the kinds (count,) and the questions of every test: the same for all methods and seeds."""
+    """Return the kinds (count,) and the questions of every test, which all methods and seeds share."""
     kind = torch.arange(count) % len(questions.kinds)
     return kind, questions.ask(kind, torch_generator("report questions"))

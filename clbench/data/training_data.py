@@ -41,7 +41,7 @@ class TrainingData:
         return cls(scenario, config, questions, test_questions)
 
     def scored_questions(self, split: ScoredSplit) -> tuple[Tensor, QuestionBatch]:
-        """Return the kinds and the questions of a run that is scored on a split.
+        """Return the kinds and the questions that score a run on a split.
 
         A tuning run, which is scored on validation episodes, must not see the test questions.
         """

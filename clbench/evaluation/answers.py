@@ -16,7 +16,7 @@ from clbench.policy.policy import Policy, evaluating
 def answer(
     policy: Policy, kinds: Sequence[QuestionKind], kind: torch.Tensor, questions: QuestionBatch
 ) -> list[tuple[str, int, int]]:
-    """Return the name of each kind of question, the number of its questions, and of correct answers.
+    """Return, for each kind of question, its name and the numbers of its questions and correct answers.
 
     A policy that cannot answer is asked nothing.
 
@@ -37,7 +37,7 @@ def answer(
 
 
 def _correct(policy: Policy, questions: QuestionBatch) -> torch.Tensor:
-    """Return which questions a policy answers rightly, (B,)."""
+    """Return which questions a policy answers correctly, (B,)."""
     right = []
     device = policy.device
     for start in range(0, len(questions), LANES):

@@ -12,11 +12,11 @@ from clbench.spec.task import Task
 
 
 class Checker:
-    """Checks during the stages of a run whether their tasks are learned, on validation episodes.
+    """Checks on validation episodes, during the stages of a run, whether their targets are learned.
 
     Args:
         scenario: Scenario with the targets that are learned.
-        protocol: Evaluation protocol of the run, with a criterion or without.
+        protocol: Evaluation protocol of the run, with or without a criterion.
         seed: Seed of the run: it chooses the initial states, the same at every check and for all methods.
     """
 

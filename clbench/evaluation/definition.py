@@ -2,14 +2,16 @@
 
 A hash covers what a score depends on besides the budget: instructions, horizon and seeds of a task, resets,
 rewards and successes of its world, plain and perturbed, the actions of its expert, and the answers to
-questions. It is a hash of behaviour in fixed episodes, so an edit that moves nothing keeps it. Two parts are
-hashes of code, without comments, docstrings and layout: the rule of each task, as fixed episodes miss a
-threshold that moves a little, and the module of a camera, as pictures differ between renderers.
+questions. It is a hash of behaviour in fixed episodes, so an edit that changes no behaviour keeps it. Two
+parts are hashes of code, without comments, docstrings and layout: the rule of each task, because fixed
+episodes miss a threshold that moves a little, and the module of a camera, because pictures differ between
+renderers.
 
 `python -m clbench.evaluation.definition` pins the definitions of the project's scenarios in
-`envs/definitions.json`; it takes the id of a new one. A changed scenario gets a new version instead, once
-records of it are public. Scenarios on LIBERO have no pin: its controller calls BLAS and LAPACK, whose last
-bits depend on the processor, and contacts make more of them. Their records are compared with each other.
+`envs/definitions.json`; its arguments are the ids of new ones. Once records of a scenario are public, a
+change to it needs a new version instead. Scenarios on LIBERO have no pin: its controller calls BLAS and
+LAPACK, whose last bits depend on the processor, and contacts amplify these differences. Their records are
+compared with each other.
 """
 
 from __future__ import annotations
@@ -45,11 +47,11 @@ EPISODES = 4
 """Fixed episodes of each task, and as many perturbed ones."""
 
 GRID = 16
-"""Actions of the expert are rounded to multiples of 1/16. An expert that is a network differs in its last
-bits between processors, which would otherwise grow along an episode."""
+"""Actions of the expert are rounded to multiples of 1/16. The actions of a network differ in their last bits
+between processors, and these differences would otherwise grow along an episode."""
 
 RANDOM = 5
-"""Every fifth action is random, so that episodes leave the way of the expert."""
+"""Every fifth action is random, so that episodes leave the path of the expert."""
 
 
 def definition(scenario: Scenario) -> dict[str, str]:
@@ -81,9 +83,9 @@ def definition(scenario: Scenario) -> dict[str, str]:
 
 
 def recording_of(task: Task) -> str | None:
-    """Return the hash of the recorded demonstrations that a task names in the place of an expert, or None.
+    """Return the hash of the recorded demonstrations that a task names in place of an expert, or None.
 
-    `clbench.exchange.recorded` has the object that such a task names as its expert.
+    `clbench.exchange.recorded` defines the object that such a task names as its expert.
     """
     recording: str | None = getattr(resolve(task.expert), "recording", None)
     return recording
@@ -102,14 +104,14 @@ def _hashes(scenario: Scenario) -> dict[str, str]:
         digest.update(kind.answer(shown).astype(np.int8).tobytes())
     hashes = {name: found[name] for name in (f"task {task.name}" for task in scored)}
     hashes["questions"] = digest.hexdigest()[:16]
-    camera = scored[0].camera  # that of all tasks
+    camera = scored[0].camera  # all tasks share it
     if camera is not None:
         hashes["camera"] = _hash_of_camera(camera, np.concatenate([states[task.name] for task in scored]))
     return hashes
 
 
 def _hash_of_camera(entry_point: str, states: NDArray[np.float32]) -> str:
-    """Return the hash of a camera: its code, and what it passes on of some states."""
+    """Return the hash of a camera: its code, and the numbers that it takes from some states."""
     camera = load_camera(entry_point)
     digest = hashlib.sha256(f"{camera.image_size} {module_code(camera.__module__)}".encode())
     for part in (camera.proprioception(states), camera.pictured(states)):
@@ -159,7 +161,7 @@ def _moments(task: Task, perturbed: bool) -> Iterator[tuple[NDArray[Any], ...]]:
 
 
 def main() -> None:
-    """Pin the definitions of the scenarios that have a pin or are named."""
+    """Pin the definitions of the scenarios that have a pin or are named as arguments."""
     found = {name: definition(load_scenario(name)) for name in sorted({*pinned(), *sys.argv[1:]})}
     pinned_file().write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 

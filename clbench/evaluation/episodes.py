@@ -1,4 +1,4 @@
-"""Episodes in lock-step, whoever acts: a policy of a run, an agent, or a policy from elsewhere.
+"""Episodes in lock-step, for any actor: a policy of a run, an agent, or a policy from elsewhere.
 
 The initial state of an episode depends only on the task, the number of the episode and the seed of the run.
 """
@@ -31,7 +31,7 @@ class Trial(NamedTuple):
 
     @property
     def key(self) -> EpisodeKey:
-        """The identity of the episode, which its outcome has, too."""
+        """The identity of the episode, which its outcome shares."""
         return EpisodeKey(self.task.name, self.split, self.number)
 
 
@@ -54,9 +54,9 @@ class Episode:
     number: int
     """Number of the episode, which chooses its initial state within its task and split."""
     success: bool
-    """Whether the success rule held before the horizon."""
+    """Whether the episode was a success by its horizon."""
     total_reward: float
-    """Sum of the dense rewards."""
+    """Sum of the rewards."""
     length: int
     """Number of steps."""
 
@@ -81,7 +81,7 @@ class Live:
     shown: Any = None
     """The instruction as the actor reads it; `begin` of `play_in_lanes` sets it."""
     memory: Any = None
-    """What the actor keeps for the episode."""
+    """Memory of the actor for this episode."""
     total_reward: float = 0.0
     length: int = 0
     success: bool = False
@@ -190,7 +190,7 @@ def _execute(lanes: Lanes, live: Sequence[Live], chunks: NDArray[np.float32], wa
 def start_of(trial: Trial, seed: int) -> tuple[int, str]:
     """Return the start of a trial in a run of `seed`: the seed of its initial state, and its instruction.
 
-    A perturbed episode has the same start as the test episode of its number.
+    A perturbed episode has the same start as the test episode with the same number.
     """
     task, split, number = trial
     wordings = task.wordings(split)

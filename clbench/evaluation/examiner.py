@@ -36,7 +36,7 @@ class Examiner:
         data: Demonstrations and questions of the scenario.
         pretrained: The pretrained policy, with which later policies are compared.
         seed: Seed of the run: it chooses the initial states.
-        progress: Called with the length of the work done since its last call, in optimiser steps.
+        progress: Called with the amount of work done since its last call, in optimiser steps.
     """
 
     def __init__(
@@ -71,8 +71,8 @@ class Examiner:
             policy: Policy to evaluate.
             point: Point of the run.
             record: Record of the run.
-            predictions_before: `predictions` before the stage, at the end of which the shift and the captured
-                share are measured; None elsewhere.
+            predictions_before: Result of `predictions` before the stage, if `point` is the end of the stage,
+                where the shift and the captured share are measured; None elsewhere.
         """
         keys = self._protocol.episodes(point)
         episodes = self._play(
@@ -120,10 +120,10 @@ class Examiner:
         return _known(shift(before, self.predictions(policy, stage), self._batch(stage).valid))
 
     def _captured(self, policy: Policy, stage: int) -> float | None:
-        """Return the share of episodes in which `policy` does a stage's target though told to do a skill.
+        """Return the share of episodes in which `policy` does a stage's target although told to do a skill.
 
-        The episodes begin as the scored ones of the target do. Skills take turns, and so do wordings: where
-        their numbers have a common factor, a skill is told in some of its wordings only.
+        The episodes begin like the scored episodes of the target. Skills take turns, and so do wordings. If
+        their numbers have a common factor, only some wordings of each skill are used.
         """
         if not self._protocol.captured_episodes:
             return None
@@ -154,7 +154,7 @@ class Examiner:
 
 
 def _known(moved: float) -> float | None:
-    """Return how far a policy moved, None for a diverged one: no reader takes its infinite or NaN numbers."""
+    """Return how far a policy moved, None for a diverged one: readers accept no infinite or NaN numbers."""
     return moved if moved <= FARTHEST else None
 
 

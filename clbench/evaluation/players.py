@@ -71,7 +71,7 @@ class Training:
     scenario: Scenario
     """The scenario."""
     stage: int | None
-    """Stage that they stay in; None if they go through all stages."""
+    """Stage that the environments stay in; None if they go through all stages."""
     order: int
     """Order of the targets."""
     instruction: InstructionFormat
@@ -86,8 +86,8 @@ def training_of(env: TrainingEnv) -> Training:
     """Return what the environments in which an agent was trained say about its training.
 
     Raises:
-        WrongTypeError: They are no environments of a scenario.
-        InputError: They differ in their scenario, their stage or their form of instructions.
+        WrongTypeError: They are not environments of a scenario.
+        InputError: They differ in their scenario, stage, order of the targets or form of instructions.
     """
     inner: Any = getattr(env, "unwrapped", env)
     names = ("scenario", "stage", "order", "instruction", "steps_taken", "begun_at")
@@ -117,7 +117,7 @@ def _is_of_stable_baselines3(agent: Agent) -> bool:
 
 
 def acts_on_batches(agent: Agent, instruction: InstructionFormat) -> bool:
-    """Return whether an agent is known to act on batches: one of Stable-Baselines3, which read tokens."""
+    """Return whether an agent is known to act on batches: an agent of Stable-Baselines3 that reads tokens."""
     return instruction == "tokens" and _is_of_stable_baselines3(agent)
 
 
@@ -137,9 +137,9 @@ def play(
         trials: Episodes by task, split and number.
         seed: Seed of the run; it chooses the initial states.
         instruction: Form of the instruction in observations.
-        batched: Whether the agent acts on `LANES` observations at once, always as many: another number of
-            rows may round differently. It may have no memory then. Otherwise it plays one episode after
-            another.
+        batched: Whether the agent acts on `LANES` observations at once, always the same number, since another
+            number of rows may round differently. Such an agent may have no memory. Any other agent plays one
+            episode after another.
 
     Raises:
         InputError: An action has the wrong shape, an agent that acts on batches returned a memory, or an
@@ -153,7 +153,7 @@ def play(
 
 
 def _check_wrappers(agent: Agent, scenario: Scenario, instruction: InstructionFormat) -> None:
-    """Refuse an agent of Stable-Baselines3 that was trained behind a wrapper which changed what it met.
+    """Refuse an agent of Stable-Baselines3 whose wrapper in training changed its observations or actions.
 
     Most wrappers would raise no error: the agent would act on other numbers than in training, and fail.
     """
@@ -178,21 +178,21 @@ def _check_wrappers(agent: Agent, scenario: Scenario, instruction: InstructionFo
 
 
 def _first_colours(space: spaces.Space[Any]) -> spaces.Space[Any]:
-    """Return the space of a picture with its colours first, as Stable-Baselines3 has it, or another space."""
+    """Return the space of a picture with its colours first, as in Stable-Baselines3; keep other spaces."""
     if not isinstance(space, spaces.Box) or len(space.shape) != 3:
         return space
     return spaces.Box(space.low.transpose(2, 0, 1), space.high.transpose(2, 0, 1), dtype=space.low.dtype.type)
 
 
 class ChunkPlay(NamedTuple):
-    """What a policy that acts in chunks did."""
+    """Episodes of a policy that acts in chunks, and the faults of its actions."""
 
     episodes: list[Episode]
     """Outcomes of the trials, in their order."""
     executed: int
-    """Actions of each chunk that were executed, at most: an episode may end before."""
+    """Maximum number of executed actions of each chunk; an episode may end earlier."""
     not_finite: float
-    """Share of the steps whose action was NaN or infinite somewhere, and was replaced."""
+    """Share of the steps whose action had a NaN or infinite number, which was replaced."""
     clipped: float
     """Share of the steps whose action was finite and outside of the action space, and was clipped."""
 
@@ -322,10 +322,10 @@ class _ChunkPlayer:
         return {f"pictures/{name}": picture for name, picture in drawn.items()}
 
     def _length(self, chunks: Any) -> int:
-        """Return the length of chunks, and remember that of the first ones.
+        """Return the length of chunks, and remember the length of the first ones.
 
         Raises:
-            InputError: They are no chunks, or have another length.
+            InputError: They are not chunks, or have another length.
         """
         length = int(np.shape(chunks)[1]) if np.ndim(chunks) == 3 else 0
         known = self.executed

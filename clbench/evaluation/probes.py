@@ -15,7 +15,7 @@ SPARSITY_THRESHOLD = 1e-3
 
 @torch.no_grad()
 def activations(policy: Policy, questions: QuestionBatch) -> Gaussian:
-    """Return a Gaussian of the policy's hidden states on `questions`, given on the policy's device."""
+    """Return a Gaussian of the policy's hidden states on `questions`, which are on the policy's device."""
     with evaluating(policy):
         hidden = policy.hidden_states(questions.state, questions.words, questions.image)
     return Gaussian.of(hidden, policy.token_mask(questions.words))
@@ -39,7 +39,7 @@ def update_sparsity(policy: Policy, pretrained: Policy) -> float | None:
 
 @torch.no_grad()
 def predictions(policy: Policy, batch: Batch) -> Tensor:
-    """Return the predictions (B, H, A) of `policy` on `batch`, given on the policy's device."""
+    """Return the predictions (B, H, A) of `policy` on `batch`, which is on the policy's device."""
     with evaluating(policy):
         return policy.predict(batch)
 

@@ -142,7 +142,7 @@ def _check_chunks(policy: Policy, chunks: object, rows: int) -> None:
     word about the policy.
 
     Raises:
-        WrongTypeError: `act()` returned something else than a float32 tensor (B, H, A) without a gradient.
+        WrongTypeError: `act()` returned something other than a float32 tensor (B, H, A) without a gradient.
     """
     wanted = (rows, policy.config.chunk, policy.config.action_size)
     if not isinstance(chunks, torch.Tensor):

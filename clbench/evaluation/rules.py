@@ -1,8 +1,8 @@
-"""The rule of a task as code: its condition of success and its reward, without comments, docstrings, layout.
+"""The rule of a task as code: its success condition and its reward, without comments, docstrings and layout.
 
-A few fixed episodes miss a threshold that moves a little; the code does not. It is that of the functions and
+A few fixed episodes miss a threshold that moves a little; the code does not. It covers the functions and
 classes that a rule reaches in its own modules, with the values that they use. A rule begins at the class of
-the world. A suite has a module `rules` with a table by task instead, of which the task's entry counts alone.
+the world. If a suite has a module `rules` with a table by task, only the task's entry counts.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class _Reached:
     """The texts of functions and values, by names that say where they were found.
 
     Args:
-        modules: Names of the modules whose functions and classes are read; of others, the name counts alone.
+        modules: Names of the modules whose functions and classes are read; in others, only names count.
     """
 
     def __init__(self, modules: set[str]) -> None:
@@ -105,7 +105,7 @@ class _Reached:
         while _is_wrapper(value):
             value = value.__wrapped__  # type: ignore[attr-defined]
         text = _function_code(value) if value.__module__ in self.modules else ""
-        if not text or self.texts.get(name) == text:  # of another module, or of no file; or here before
+        if not text or self.texts.get(name) == text:  # of another module or without a file, or known
             return
         self.texts[name] = text
         self._add_all(name, inspect.getclosurevars(value).nonlocals)
@@ -114,7 +114,7 @@ class _Reached:
             self.add(self._own_name(other, value.__module__, found), found)
 
     def _own_name(self, name: str, module: str, value: object) -> str:
-        """Return a name of a module that no other value has: another value's gets its module before it."""
+        """Return a unique name of a value: if another value has the name, its module goes before it."""
         return name if self._first.setdefault(name, value) is value else f"{module}.{name}"
 
 
@@ -125,13 +125,13 @@ def _is_wrapper(function: FunctionType) -> bool:
 
 
 def _function_code(function: FunctionType) -> str:
-    """Return the code of a function; of a lambda, that of all lambdas on its line."""
+    """Return the code of a function; for a lambda, the code of all lambdas on its line."""
     found = _functions(_source(function.__module__)).get(function.__code__.co_firstlineno, ())
     return "; ".join(found)
 
 
 def _source(module: str) -> str:
-    """Return the source of a module, nothing for one that has no file, such as a prompt."""
+    """Return the source of a module, empty for a module without a file, such as a prompt."""
     try:
         return _text(importlib.import_module(module))
     except (ImportError, OSError, TypeError):
@@ -164,14 +164,14 @@ def _tree(source: str) -> ast.Module:
 
 
 def _bodies(tree: ast.Module) -> Iterator[tuple[Any, list[ast.stmt]]]:
-    """Yield the parts of a module that have statements, with these."""
+    """Yield the nodes of a module that have statements, each with its statements."""
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
-        if isinstance(body, list):  # a lambda's is an expression
+        if isinstance(body, list):  # the body of a lambda is an expression
             yield node, body
 
 
 def _is_text(node: ast.stmt) -> bool:
-    """Return whether a statement is a text alone, as a docstring is."""
+    """Return whether a statement is only a string, as a docstring is."""
     constant = node.value if isinstance(node, ast.Expr) else None
     return isinstance(constant, ast.Constant) and isinstance(constant.value, str)

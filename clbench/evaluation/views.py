@@ -1,7 +1,7 @@
 """Pictures of running episodes from a simulator's own cameras, for a policy that sees what a robot sees.
 
-They are for policies of other programs. Those of clbench see a task's `Camera`, which is drawn from the state
-alone.
+They are for policies of other programs. Policies of clbench see the pictures of a task's `Camera`, which are
+drawn from the state alone.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ SIZE = 224
 class Views:
     """Cameras of simulators, and the size of their pictures.
 
-    A renderer belongs to one compiled scene and takes seconds to make: it stays for all episodes of a scene.
+    A renderer belongs to one compiled scene and takes seconds to make, so it serves all episodes of a scene.
 
     Args:
         cameras: Names of cameras that the scenes of all tasks have.
         size: Height and width N of a picture in pixels.
 
     Raises:
-        InputError: A name is there twice or no text, or the size is no whole number from 1.
+        InputError: A name occurs twice or is not a text, or the size is not a whole number of at least 1.
     """
 
     def __init__(self, cameras: Sequence[str], size: int = SIZE) -> None:
@@ -49,7 +49,7 @@ class Views:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the record of a run keeps, empty without a camera."""
+        """Settings that the record of a run keeps; empty without a camera."""
         return {"pictures": list(self.cameras), "picture_size": self.size} if self.cameras else {}
 
     def check(self, tasks: Iterable[Task]) -> None:
@@ -57,8 +57,8 @@ class Views:
 
         Raises:
             UnknownNameError: A scene has no such camera.
-            InputError: A world has no scene to draw, the scenes have no camera in common, or one draws no
-                picture of this size.
+            InputError: A world has no scene to draw, the scenes have no camera in common, or one cannot draw
+                pictures of this size.
         """
         names, sizes = [], []
         with closing(Lanes(1)) as lanes:
@@ -101,7 +101,7 @@ class Views:
                 raise RenderingError(
                     f"This machine cannot draw ({error}): `clbench doctor` says what is missing."
                 ) from error
-            self._renderers[id(model)] = model, renderer  # a scene that is kept keeps its id
+            self._renderers[id(model)] = model, renderer  # while the scene is kept, its id is not reused
         return self._renderers[id(model)][1]
 
     def close(self) -> None:

@@ -52,9 +52,9 @@ def export_demonstrations(
     Args:
         scenario: Scenario, or its Gymnasium id.
         output: New folder.
-        format: "lerobot" for one LeRobotDataset v3 of all tasks, or "hdf5" for one file of the layout of
-            robomimic and LIBERO for each task, `TASK_demo.hdf5`.
-        tasks: Names of tasks, or one name; the retained skills and the targets if there are none.
+        format: "lerobot" for one LeRobotDataset v3 of all tasks, or "hdf5" for one file per task,
+            `TASK_demo.hdf5`, in the layout of robomimic and LIBERO.
+        tasks: Names of tasks, or one name; if empty, the retained skills and the targets.
         noisy: Whether to export the episodes with action noise, too.
 
     Raises:
@@ -78,7 +78,7 @@ def export_demonstrations(
 
 
 def chosen_tasks(scenario: Scenario | str, tasks: Iterable[str]) -> tuple[Scenario, list[Task]]:
-    """Return a scenario, and those of its tasks that have some names, or one name.
+    """Return a scenario, and its tasks with the given names; without names, its skills and targets.
 
     Raises:
         UnknownNameError: A name is unknown; the nearest one is named.
@@ -89,12 +89,12 @@ def chosen_tasks(scenario: Scenario | str, tasks: Iterable[str]) -> tuple[Scenar
 
 
 def check_output(output: Path | str, kind: str, tasks: Sequence[Task]) -> Path:
-    """Return the folder of an export of some tasks, before any work starts.
+    """Check the output of an export before any work starts, and return its folder.
 
     Raises:
         InputError: The folder exists, or a world does not give its steps per second.
         UnknownNameError: There is no such format.
-        MissingPackageError: A package that it needs is not installed.
+        MissingPackageError: A package that the format needs is not installed.
     """
     if kind not in get_args(Format):
         raise unknown("format", kind, get_args(Format))
@@ -117,9 +117,9 @@ def _without_noise(task: Task, episodes: Sequence[Demonstration]) -> list[Demons
 
 
 def _warn_if_constant(tasks: Iterable[Sequence[Demonstration]]) -> None:
-    """Name the numbers of the actions that never change: libraries scale a policy's actions by the deviation.
+    """Warn of numbers of the actions that never change: libraries scale actions by their deviation.
 
-    It is 0 then, and the policy returns the mean, whatever its weights are.
+    The deviation of such a number is 0, and the policy returns its mean, whatever the weights are.
     """
     actions = np.concatenate([episode.expert[:-1] for episodes in tasks for episode in episodes])
     constant = np.flatnonzero(np.ptp(actions, axis=0) == 0)
@@ -149,7 +149,7 @@ _WRITERS = {"lerobot": _write_dataset, "hdf5": _write_files}
 
 
 def _in_one_step(folder: Path, fill: Callable[[Path], None]) -> Path:
-    """Return a folder that appears when it is complete.
+    """Fill a folder, which appears only when it is complete, and return it.
 
     Raises:
         InputError: The folder cannot be made.
@@ -171,15 +171,15 @@ def import_demonstrations(
 ) -> str:
     """Keep the demonstrations of an HDF5 file as the Minari dataset of a task, and return its id.
 
-    The task must name these demonstrations in the place of an expert; if it does not, the error says how. The
-    definition of the scenario, which is in all its records, then says which demonstrations the task has.
+    The task must name these demonstrations in place of an expert; if it does not, the error says how. The
+    definition of the scenario, which all its records hold, then says which demonstrations the task has.
 
     Args:
         scenario: Scenario of your own, or its Gymnasium id.
         task: Name of the task.
-        path: File of the layout of robomimic and LIBERO, with one group `data/demo_i` for each demonstration.
-        state: Datasets of each demonstration that make, side by side, the state of the task's world, for
-            example ("obs/ee_states", "obs/gripper_states"), or the name of the only one.
+        path: File in the layout of robomimic and LIBERO, with one group `data/demo_i` for each demonstration.
+        state: Names of the datasets of a demonstration that form, side by side, the state of the task's
+            world, for example ("obs/ee_states", "obs/gripper_states"), or the name of a single dataset.
 
     Raises:
         InputError: The file cannot be read or does not fit the task, the task has an expert or names other

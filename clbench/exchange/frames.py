@@ -1,4 +1,4 @@
-"""Many records as one table of pandas, for analyses of one's own."""
+"""Many records as one table of pandas, for your own analyses."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def load_records(folder: Path | str = RECORDS) -> pandas.DataFrame:
     Columns: `scenario` (Gymnasium id), `policy` ("flow", "discrete_diffusion" and so on), `method` (with
     changed settings, as "lora+rank=4"), `seed`, `order`, `stage` (0 is before the first target), `step`
     (optimiser steps done in the stage), `task`, `group` ("retained", "target" or "held_out"), `split`
-    ("test", "validation" or "perturbed"), `episode`, `success` (a boolean) and `length` (steps). Left out
-    are records of failed runs, files that are no records, that contradict themselves or that are not at the
-    place of their run (SCENARIO/METHOD/seed-N.json), and second records of a run; the log names them.
+    ("test", "validation" or "perturbed"), `episode`, `success` (a boolean) and `length` (steps). Records of
+    failed runs and second records of a run are left out. So are files that are not records, that contradict
+    themselves, or that are not at the place of their run (SCENARIO/METHOD/seed-N.json). The log names them.
 
     Args:
         folder: Folder of records, at any depth.
@@ -61,7 +61,8 @@ def _read(path: Path) -> tuple[Record, Path]:
     """Return the record of a run that succeeded, and its path from the folder of records.
 
     Raises:
-        RecordError: It cannot be read, contradicts itself, is not at the place of its run, or the run failed.
+        RecordError: The record cannot be read, contradicts itself or is not at the place of its run, or the
+            run failed.
     """
     record = read_record(path)
     try:

@@ -42,7 +42,7 @@ FARTHEST_RATE = 0.01
 _NAME = re.compile(r"demo_([0-9]+)")
 
 MOST_NUMBERS = 10_000_000
-"""Numbers of a dataset that is read: 1,000 steps of 100 numbers are 0.1 million; 60 kB can claim billions."""
+"""Most numbers of a dataset to read. 1,000 steps of 100 numbers are 0.1 million; 60 kB can claim billions."""
 
 _DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, MemoryError)
 """Errors that h5py raises where the bytes of a file make no sense."""
@@ -106,13 +106,13 @@ def _attributes(task: Task, episodes: Sequence[Demonstration]) -> dict[str, Any]
 def read_hdf5(path: Path, task: Task, state: Sequence[str] = ("states",)) -> list[Demonstration]:
     """Return the demonstrations in an HDF5 file, which must fit a task.
 
-    A file of others has no final state and no final action: they are NaN, and no policy learns from them.
+    A file from elsewhere has no final state and no final action. They become NaN; no policy learns from them.
 
     Args:
         path: The file.
         task: Task whose world, horizon and instructions the demonstrations must fit.
-        state: Datasets of each demonstration that make, side by side, the state of the world (S,), or the
-            name of the only one.
+        state: Names of the datasets of a demonstration that form, side by side, the state of the world (S,),
+            or the name of a single dataset.
 
     Raises:
         InputError: The file cannot be read, has another layout, or does not fit the task. The message names
@@ -136,7 +136,7 @@ def read_hdf5(path: Path, task: Task, state: Sequence[str] = ("states",)) -> lis
 
 
 def _check_readable(path: Path) -> None:
-    """Check that a path is a file that can be read: HDF5 would answer with flags and addresses."""
+    """Check that a path is a readable file: HDF5's own error would show flags and addresses."""
     try:
         if (path / "meta" / "info.json").is_file():
             raise InputError(
@@ -153,7 +153,7 @@ def _check_readable(path: Path) -> None:
 
 
 def _is_own_group(data: h5py.Group, name: str) -> bool:
-    """Return whether an entry is a group in this place, and no link to another one."""
+    """Return whether an entry is a group in this place, not a link to another one."""
     is_here = isinstance(data.get(name, getlink=True), h5py.HardLink)
     return is_here and data.get(name, getclass=True) is h5py.Group
 
@@ -262,7 +262,7 @@ class _File:
         )
 
     def _converted(self, states: NDArray[Any], group: h5py.Group, where: str) -> NDArray[Any]:
-        """Return the states as those of the world, which may read the `states` of its original's files."""
+        """Return the states as the world has them; it may convert the `states` in files of its original."""
         if self._convert is None or self._names != ("states",) or states.shape[1:] == self._states.shape:
             return states
         try:
@@ -302,7 +302,7 @@ class _File:
         return values
 
     def _numbers(self, group: h5py.Group, name: str, where: str, axes: tuple[str, ...]) -> NDArray[Any]:
-        """Return a dataset of numbers with some axes, which the message names."""
+        """Return a dataset of numbers with the given axes, which the message names."""
         if not (name in group and isinstance(group[name], h5py.Dataset)):
             known: list[str] = []
             group.visititems(lambda key, one: known.append(key) if isinstance(one, h5py.Dataset) else None)

@@ -32,8 +32,8 @@ IMAGE = "observation.images.image"
 """Name of the picture that a policy sees; the camera is called image, as in `clbench/serving/server.py`."""
 
 ENVIRONMENT_STATE = "observation.environment_state"
-"""Second name of the state where there is no picture: LeRobot's ACT and diffusion policies refuse to go
-without one of the two."""
+"""Second name of the state where there is no picture: LeRobot's ACT and diffusion policies need one of the
+two."""
 
 QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
 """Quantiles among the statistics, as in LeRobot: q01 to q99."""
@@ -45,7 +45,7 @@ Columns = dict[str, NDArray[Any]]
 def write_lerobot(folder: Path, tasks: Mapping[Task, Sequence[Demonstration]]) -> None:
     """Write the demonstrations of tasks as one LeRobotDataset.
 
-    The episodes of a task have its wordings in turn as their task.
+    The `task` of each episode is a wording of its instruction; the wordings of a task take turns.
 
     Args:
         folder: Folder to fill.
@@ -205,7 +205,7 @@ def _statistics(values: NDArray[Any]) -> Columns:
 def _of_pictures(pictures: NDArray[np.uint8]) -> Columns:
     """Return the statistics of pictures (N, height, width, 3) per colour (3,), from counts of the 256 levels.
 
-    As float64, the pictures would take eight times the memory of the data set, twice over.
+    As float64, the pictures would take eight times the memory of the dataset, twice over.
     """
     counts = np.zeros((256, 3))
     for picture in pictures:
@@ -216,7 +216,7 @@ def _of_pictures(pictures: NDArray[np.uint8]) -> Columns:
     until = counts.cumsum(axis=0)
 
     def ranked(rank: float) -> NDArray[np.float64]:
-        """Return the value of a rank from 0 on in rising order, for each colour."""
+        """Return the value at a rank, counted from 0 in ascending order, for each colour."""
         return np.asarray((until > rank).argmax(axis=0) / 255)
 
     def quantile(share: float) -> NDArray[np.float64]:

@@ -1,9 +1,9 @@
-"""Recordings: demonstrations from a file, which a task names in the place of its expert.
+"""Recordings: demonstrations from a file, which a task names in place of its expert.
 
 The task has `expert="clbench.exchange.recorded:demonstrations_0123456789abcdef"`. The digits are a hash of
-the demonstrations. They are a part of everything that is made from the task: the id of its Minari dataset,
+the demonstrations. The hash is part of everything that is made from the task: the id of its Minari dataset,
 the keys of policies, and the definition of its scenario, which every record holds. Nothing ever plays such an
-expert, so no demonstration can take the place of those in the file.
+expert, so no other demonstrations can replace those in the file.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def no_expert(task: str, recording: str) -> str:
 
 
 def recording_hash(episodes: Iterable[Demonstration]) -> str:
-    """Return the hash of demonstrations: of every bit of them, and of nothing else in a file."""
+    """Return the hash of demonstrations, which covers every bit of them and nothing else in a file."""
     digest = hashlib.sha256()
     for episode in episodes:
         for name, value in vars(episode).items():

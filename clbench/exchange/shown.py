@@ -1,4 +1,4 @@
-"""What a data set for others holds of each demonstration: what a policy sees, and the actions to learn."""
+"""The content of a dataset for other libraries: what a policy sees in a demonstration, and its actions."""
 
 from __future__ import annotations
 

@@ -36,11 +36,12 @@ def adapt(
     budget: Budget,
     after: Callable[[Step], bool | None] = lambda _: None,
 ) -> int:
-    """Let `method` fine-tune the policy on one target, in place, and return the optimiser steps done.
+    """Let `method` fine-tune the policy on one target, in place, and return the number of optimiser steps.
 
-    Without a criterion every stage has the same steps, and the learning rate falls along a cosine. With one,
-    the stage ends when `after` returns True. The learning rate is then constant after its warm-up. `after` is
-    also called before the first step: a policy that has learned the target already takes none.
+    Without a criterion every stage has the same number of steps, and the learning rate falls along a cosine.
+    With a criterion the stage ends when `after` returns True, and the learning rate is constant after its
+    warm-up. `after` is then also called before the first step: a policy that already knows the target takes
+    no step.
 
     Args:
         policy: Policy to train.
@@ -114,7 +115,7 @@ def check_finite(policy: Policy, after: str) -> None:
 
     Args:
         policy: The policy.
-        after: What the method has just done.
+        after: What the method has just done, for the message.
 
     Raises:
         MethodError: A parameter or a buffer is not finite.
@@ -126,7 +127,7 @@ def check_finite(policy: Policy, after: str) -> None:
 
 
 def _not_finite(policy: Policy) -> str:
-    """Return whose gradients are not finite: the first parameter, and the number of others."""
+    """Return the first parameter whose gradient is not finite, and the number of others, for a message."""
     names = [
         name
         for name, parameter in policy.named_parameters()

@@ -37,7 +37,7 @@ LEAST_SHARE, MOST_SHARE = 0.2, 0.7
 """Bounds of the share of masked tokens in a block."""
 
 SHARE_OF_STEPS = 0.1
-"""Steps of the distillation, as a share of those of pretraining; the paper has a fifth to an eighth."""
+"""Steps of the distillation, as a share of the pretraining steps; the paper has a fifth to an eighth."""
 
 
 def distilled(
@@ -89,7 +89,7 @@ def distillation_loss(
 
     Args:
         teacher: Policy whose backbone reads the observations.
-        teaching: Its head.
+        teaching: Head of the teacher.
         head: Head of the student.
         batch: Demonstrated action chunks.
         share: Share of masked tokens of each block, (B, N).
@@ -112,7 +112,8 @@ def distillation_loss(
 def shares(draws: Tensor) -> Tensor:
     """Return the shares of masked tokens (B, N), which grow along the chunk, from uniform draws (B, N).
 
-    D2F: the first is uniform, and each next one adds at most an equal part of what is left to the bound.
+    As in D2F, the first share is uniform, and each later one adds at most an equal part of the rest up to the
+    bound.
     """
     first = LEAST_SHARE + (MOST_SHARE - LEAST_SHARE) * draws[:, :1]
     steps = draws[:, 1:] * (MOST_SHARE - first) / max(draws.shape[1] - 1, 1)
@@ -120,7 +121,7 @@ def shares(draws: Tensor) -> Tensor:
 
 
 def with_blocks(policy: Policy, block: int) -> Policy:
-    """Return a copy of a discrete-diffusion policy whose tokens read their own block and earlier ones alone.
+    """Return a copy of a discrete-diffusion policy whose tokens read only their own block and earlier ones.
 
     Args:
         policy: The policy.

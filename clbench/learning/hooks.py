@@ -1,4 +1,4 @@
-"""The hooks of a method: which a class misspells, which the loop cannot call, which raised an error."""
+"""Checks of a method's hooks: which are misspelt, which the loop cannot call, and which raised an error."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def functions_of(cls: type) -> dict[str, FunctionType]:
 def uncalled_functions(cls: type[Method]) -> dict[str, str]:
     """Return the public functions of a method that neither the loop nor the class calls.
 
-    Each has the end of a message with the hook whose name is near, empty if none is.
+    The value for each is the end of a message with the hook of the nearest name, empty if none is near.
     """
     functions = [item for base in own_classes(cls) for item in functions_of(base).items()]
     used = set(HOOKS).union(*(names_in(function.__code__) for _, function in functions))
@@ -55,7 +55,7 @@ def uncalled_functions(cls: type[Method]) -> dict[str, str]:
 def misfits(cls: type[Method]) -> dict[str, tuple[str, str]]:
     """Return the hooks that the loop cannot call, each with its arguments in `Method` and in the class.
 
-    A value in the place of a hook, such as a field of its name, is "the value 0.5".
+    A value in the place of a hook, such as a field with the hook's name, appears as "the value 0.5".
     """
     found = {}
     for hook in HOOKS:
@@ -83,7 +83,7 @@ DECLARATIONS: dict[str, tuple[Any, str]] = {
 
 
 def misdeclared(cls: type[Method]) -> dict[str, str]:
-    """Return the declarations of a class that have another type, each with what it must be."""
+    """Return the declarations of a class that have the wrong type, each with the right type in words."""
     return {
         name: words
         for name, (kind, words) in DECLARATIONS.items()
@@ -96,7 +96,7 @@ def place_of(error: BaseException, place: str) -> str:
 
     Args:
         error: The error, with its traceback and those of the errors that caused it.
-        place: What ran: a stage, or a hook.
+        place: The stage or the hook that ran.
     """
     for frame in _frames_of_method(error):
         hook = frame.f_code.co_name

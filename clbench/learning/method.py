@@ -67,7 +67,7 @@ class Stage:
     seed: int
     """Seed for the method's own random draws in this stage."""
     steps: int
-    """Most optimiser steps of the stage; it ends earlier if it has a criterion and meets it."""
+    """Maximum number of optimiser steps of the stage, which ends earlier if it meets a criterion."""
     target: Source[Batch]
     """Demonstrations of the task."""
     prior: Prior
@@ -81,7 +81,7 @@ class Progress:
     step: int
     """Number of optimiser steps done."""
     steps: int
-    """Number of optimiser steps of the whole stage, at most, or of the whole pretraining."""
+    """Maximum number of optimiser steps of the stage, or number of steps of the pretraining."""
     to_criterion: bool = False
     """Whether the stage ends as soon as the target is learned; False in the pretraining."""
 
@@ -115,7 +115,7 @@ class Method:
     that `end_task` would leave then."""
 
     def watch_pretraining(self, policy: Policy, progress: Progress) -> None:
-        """Look at the pretraining: before its first step, as step 0, and after each step.
+        """Watch the pretraining: called before its first step, as step 0, and after each step.
 
         If a method overrides this hook, the pretraining is repeated before `prepare`, in every scenario, and
         its steps count as the method's. The loss of the pretraining is the mean action loss on the skills
@@ -134,7 +134,7 @@ class Method:
 
         Args:
             policy: Pretrained policy; changes stay.
-            prior: Data that `uses` declares, of the retained skills. It closes afterwards.
+            prior: Data of the retained skills that `uses` declares. It closes after this hook.
 
         Returns:
             The number of optimiser steps that it took, or that a cached result once took; None counts as 0.
@@ -143,8 +143,8 @@ class Method:
     def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter] | list[dict[str, Any]]:
         """Return the parameters to train on this target, or optimiser groups of them.
 
-        Where a criterion ends the stage, it takes no optimiser steps: only the steps of the loop are checked
-        against the criterion.
+        Where a criterion ends the stage, this hook must take no optimiser steps: only the steps of the loop
+        are checked against the criterion.
 
         Args:
             policy: Policy to train.
@@ -156,11 +156,11 @@ class Method:
         """Return the training data of this step; it is passed to `loss` unchanged.
 
         Args:
-            target: Demonstrations of the target. A step may draw `target.batch_size` of them, not more.
+            target: Demonstrations of the target. A step may draw at most `target.batch_size` of them.
             prior: Data of earlier tasks that `uses` declares "throughout".
 
         Raises:
-            MissingDataError: By `sample` of a source without data.
+            MissingDataError: The hook calls `sample` of a source without data.
         """
         return target.sample(target.batch_size)
 
@@ -184,7 +184,7 @@ class Method:
         loss.backward()  # type: ignore[no-untyped-call]
 
     def learning_rate(self, scheduled: float, progress: Progress) -> float:
-        """Return the learning rate of a group of the optimiser, for each group after `loss` and `gradients`.
+        """Return the learning rate of an optimiser group; called for each after `loss` and `gradients`.
 
         Args:
             scheduled: The scenario's learning rate, or the group's own, times `step_factor` and the schedule.
@@ -208,7 +208,7 @@ class Method:
 
         Returns:
             A flat dictionary of tensors, strings, numbers, Booleans and None. `**vars(batch)` stores the
-            tensors of a `Batch`, and `Batch(**state)` makes it again.
+            tensors of a `Batch`, and `Batch(**state)` rebuilds it.
         """
         return {}
 

@@ -21,7 +21,7 @@ BETAS = (0.9, 0.95)
 """Betas of AdamW, as in ConSFT (arXiv 2605.08879) and openpi; notes on AEGIS and CapVector name none."""
 
 WEIGHT_DECAY = 1e-10
-"""Weight decay of AdamW, from the same two."""
+"""Weight decay of AdamW, from the same two sources."""
 
 
 class MethodError(ClbenchError, RuntimeError):
@@ -48,7 +48,7 @@ def warm_up(step: int) -> float:
 
 
 def learning_rate_factor(step: int, steps: int) -> float:
-    """Return the learning rate at `step` as a share of its peak: 5 % warm-up, a cosine toward a tenth."""
+    """Return the learning rate at `step` as a share of its peak: 5 % warm-up, then a cosine toward 0.1."""
     rising = max(1, round(0.05 * steps))
     if step < rising:
         return (step + 1) / rising
@@ -58,7 +58,7 @@ def learning_rate_factor(step: int, steps: int) -> float:
 
 @contextmanager
 def deterministic(device: str = "cpu") -> Iterator[None]:
-    """Use one thread and deterministic kernels inside, so that a computation repeats itself bit for bit."""
+    """Use one thread and deterministic kernels in the block, so that a computation repeats bit for bit."""
     if device != "cpu":
         # with another workspace cuBLAS may choose another kernel each time
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
@@ -104,7 +104,7 @@ def optimise(
     Args:
         parameters: Parameters to train, or optimiser groups of them.
         learning_rate: Peak learning rate, for groups without their own.
-        steps: Number of steps, at most.
+        steps: Maximum number of steps.
         loss_at: Returns the scalar loss of a step.
         gradients: Sets the gradients from the loss.
         after: Called after each step with the number of steps done. Training ends if it returns True.

@@ -52,7 +52,7 @@ AFTER_PRETRAINING = (
 
 
 def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
-    """Return everything that a pretrained policy depends on: its seed, or the weights that it brings."""
+    """Return everything that a pretrained policy depends on; weights that it brings replace its seed."""
     tasks = scenario.pretrained + scenario.scenes
     suites = {
         *packages_of(tasks, "world", "expert", "camera"),
@@ -79,7 +79,7 @@ def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
 def _own_weights(scenario: Scenario, seed: int) -> dict[str, str]:
     """Return the hash of the weights that a class of policies brings, nothing if clbench trains them.
 
-    They may lie in a file that no source names, and that somebody replaces.
+    The weights may lie in a file that no source names, and that somebody may replace.
     """
     cls = policy_class(kind_of(scenario.policy))
     return {"weights": _weights_hash(cls, policy_config(scenario), seed)} if cls.pretrained else {}
@@ -91,7 +91,7 @@ def _weights_hash(cls: type[Policy], config: PolicyConfig, seed: int) -> str:
 
 
 def shipped_folder(scenario: Scenario, seed: int) -> Path:
-    """Return the folder of the pretrained policy if it ships."""
+    """Return the folder in which the pretrained policy lies if it ships with the package."""
     kind = "" if scenario.policy == DEFAULT_POLICY else f"-{folder_name(scenario.policy)}"
     return SHIPPED / f"{scenario.id.replace('/', '--')}{kind}-seed-{seed}"
 

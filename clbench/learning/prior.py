@@ -157,7 +157,7 @@ class Source(Generic[Rows]):
 
 
 def begin_step(source: Source[Any]) -> None:
-    """Let the step that begins draw no more than `batch_size` samples."""
+    """Let the step that begins draw at most `batch_size` samples."""
     source._left = source.batch_size
 
 
@@ -167,9 +167,9 @@ def end_steps(source: Source[Any]) -> None:
 
 
 def twin_of(source: Source[Rows]) -> Source[Rows]:
-    """Return a source of the same data, whose draws begin where those of `source` are now.
+    """Return a source of the same data that continues with the next draws of `source`.
 
-    It closes with `source`.
+    It closes together with `source`.
     """
     generator = torch.Generator(source._generator.device)
     generator.set_state(source._generator.get_state())

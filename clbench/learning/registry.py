@@ -47,7 +47,7 @@ def load_method(spec: str) -> type[Method]:
         is_policy = isinstance(cls, type) and issubclass(cls, Policy)
         hint = f" It is a policy: give it as `--policy {spec}`." if is_policy else ""
         raise WrongTypeError(f"{spec!r} is not a subclass of clbench.Method.{hint}")
-    if "__dataclass_fields__" not in vars(cls):  # it inherits those of Method
+    if "__dataclass_fields__" not in vars(cls):  # only the fields of Method
         raise WrongTypeError(f"{spec!r} is not a dataclass: decorate it with @dataclasses.dataclass.")
     for name, hint in uncalled_functions(cls).items():
         # a misspelt hook would run as plain fine-tuning, and nobody would know
@@ -138,7 +138,7 @@ def new_method(spec: str, cls: type[Method], values: Mapping[str, Any]) -> Metho
 
 
 def _held(name: str, value: Any, hint: Any) -> Any:
-    """Return a value as a field of the type `hint` holds it: 5 is 5.0 where no whole number belongs."""
+    """Return a value as a field of the type `hint` holds it: 5 becomes 5.0 if the type has no int."""
     kinds = _kinds(hint)
     items = [get_args(kind) for kind in kinds if get_origin(kind) is list]
     if items and isinstance(value, list):
@@ -179,7 +179,7 @@ def _kinds(hint: Any) -> tuple[Any, ...]:
 def _read(name: str, text: str, hint: Any) -> Any:
     """Return `text` as a value of the type `hint`.
 
-    It is str, int, float, bool, a `Literal`, a list, whose text is JSON, or a union of these and None.
+    `hint` is str, int, float, bool, a `Literal`, a list, whose text is JSON, or a union of these and None.
     """
     kinds = _kinds(hint)
     if text.lower() == "none" and NoneType in kinds:

@@ -47,7 +47,7 @@ class Trainer:
         pretrained: The pretrained policy, on the device where the run computes; it is not changed.
         new_method: Returns a new object of the method.
         seed: Seed of the run.
-        pretraining_seed: Seed of the pretrained policy, if it is another one.
+        pretraining_seed: Seed of the pretrained policy, if it differs from `seed`.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class Trainer:
             scenario: Scenario with the targets that are learned.
             new_method: Returns a new object of the method.
             seed: Seed of the run.
-            device: Device on which the policy is computed.
+            device: Device on which the policy computes.
         """
         pretrained, _ = pretrained_policy(scenario, seed)
         data = TrainingData.open(scenario, pretrained.config)
@@ -93,7 +93,7 @@ class Trainer:
 
     @property
     def device(self) -> torch.device:
-        """Device on which the policy is computed."""
+        """Device on which the policy computes."""
         return self.pretrained.device
 
     def prepare(self, progress: ProgressCallback = no_progress) -> int:
@@ -169,8 +169,8 @@ class Trainer:
     def finished(self) -> Policy:
         """Return the policy that the running stage would leave if it ended now; the stage goes on as it was.
 
-        That is the policy in training, unless the method is one of `whole_stages`: then its `end_task` works
-        on copies of the policy and of the method, with the draws that come next.
+        This is the policy in training, unless the method declares `whole_stages`: then its `end_task` works
+        on copies of the policy and of the method, with the next random draws.
         """
         if not self.method.whole_stages:
             return self.policy
@@ -227,7 +227,7 @@ class Trainer:
         """Load the policy and the method that stage `number` left in `folder`."""
         self.where = f"load_state() after stage {number}"
         self.method = self.new_method()
-        # adapters are drawn before they are filled
+        # adapters draw random values before the file fills them
         with seeded("method", self.seed, number), self._hooks(number):
             try:
                 self.policy = load_stage(folder, self.method, self.device, self.scenario.policy)
@@ -245,7 +245,7 @@ def load_stage(folder: Path, method: Method, device: torch.device | str, policy:
     Args:
         folder: Folder of the stage.
         method: New object of the method.
-        device: Device on which the policy is computed.
+        device: Device on which the policy computes.
         policy: Name of the policy.
 
     Raises:

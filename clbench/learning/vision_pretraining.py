@@ -22,7 +22,7 @@ from clbench.policy.vision import Vision
 from clbench.worlds.camera import Camera
 
 STEPS_SHARE = 0.25
-"""Steps of the vision for each step of pretraining."""
+"""Steps of the vision's pretraining for each step of the policy's pretraining."""
 LEARNING_RATE = 3e-3
 """Peak learning rate."""
 NUMBERS_WEIGHT = 3.0

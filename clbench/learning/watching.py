@@ -1,4 +1,4 @@
-"""Pretraining, repeated for a method that watches it: some need to know how the skills were learned."""
+"""Pretraining, repeated for methods that watch it: they need to know how the skills were learned."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ def watch(
     hooks: Callable[[], AbstractContextManager[None]],
     progress: ProgressCallback,
 ) -> MethodState:
-    """Let a method watch the pretraining, unless the cache has what it kept, and return its state after it.
+    """Let a method watch the pretraining, and return its state afterwards, from the cache if it is there.
 
     Args:
         method: The method.
-        pretrained: The policy that was pretrained; the same must come out again.
-        scenario: Its scenario.
-        seed: Its seed.
+        pretrained: The pretrained policy, which the repeated pretraining must reproduce.
+        scenario: Scenario of the pretraining.
+        seed: Seed of the pretraining.
         hooks: Returns the context in which hooks run.
         progress: Called with the number of steps done since its last call.
 
     Raises:
-        MethodError: The method does not declare prior demonstrations or changed the pretraining, or there was
-            none, as the policy has pretrained weights of its own.
+        MethodError: The method does not declare prior demonstrations, or it changed the pretraining, or there
+            was no pretraining, because the policy has pretrained weights of its own.
     """
     if pretrained.pretrained:
         policy = type(pretrained).__name__

@@ -23,7 +23,7 @@ class Gaussian:
 
     @classmethod
     def of(cls, hidden: Sequence[Tensor], mask: Tensor) -> Gaussian:
-        """Return the mean and the deviation over all tokens of all samples that are read.
+        """Return the mean and the deviation over all tokens that are read, in all samples.
 
         Args:
             hidden: Hidden states, one (B, P, W) per layer.

@@ -26,13 +26,13 @@ class Attention(nn.Module):
         return self.attend(tokens, self.keys_and_values(memory), mask)
 
     def keys_and_values(self, memory: Tensor) -> Tensor:
-        """Return what the memory (B, P, W) offers to queries, (2, B, heads, P, W / heads)."""
+        """Return the keys and values of the memory (B, P, W), (2, B, heads, P, W / heads)."""
         batch, length, _ = memory.shape
         both = self.key_value(memory).view(batch, length, 2, self.heads, -1)
         return cast(Tensor, both.permute(2, 0, 3, 1, 4))
 
     def attend(self, tokens: Tensor, keys_and_values: Tensor, mask: Tensor) -> Tensor:
-        """Map tokens (B, Q, W) to (B, Q, W) by what they read of the keys and values."""
+        """Map tokens (B, Q, W) to (B, Q, W): their queries read the keys and values."""
         batch, length, width = tokens.shape
         query = self.query(tokens).view(batch, length, self.heads, -1).transpose(1, 2)
         key, value = keys_and_values
@@ -59,11 +59,11 @@ class Layer(nn.Module):
         return tokens + cast(Tensor, self.feed_forward(tokens))
 
     def keys_and_values(self, tokens: Tensor) -> Tensor:
-        """Return what the tokens (B, Q, W) offer to others, (2, B, heads, Q, W / heads)."""
+        """Return the keys and values of the tokens (B, Q, W), (2, B, heads, Q, W / heads)."""
         return self.attention.keys_and_values(self.attention_norm(tokens))
 
     def go_on(self, tokens: Tensor, mask: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
-        """Map tokens (B, Q, W) to (B, Q, W) like `forward`, given the keys and values of the tokens before.
+        """Map tokens (B, Q, W) to (B, Q, W) like `forward`, given the keys and values of earlier tokens.
 
         Args:
             tokens: Tokens that follow the earlier ones.
@@ -71,7 +71,7 @@ class Layer(nn.Module):
             before: Keys and values of P earlier tokens, (2, B, heads, P, W / heads).
 
         Returns:
-            The tokens, and the keys and values of the earlier and of these tokens.
+            The mapped tokens, and the keys and values of the earlier tokens and of these.
         """
         own = self.attention_norm(tokens)
         known = torch.cat([before, self.attention.keys_and_values(own)], dim=3)

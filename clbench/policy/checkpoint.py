@@ -33,7 +33,7 @@ class MisfitError(CheckpointError):
 
     Args:
         folder: Folder of the checkpoint.
-        names: Names of the tensors that one of the two lacks, or has in another shape or type.
+        names: Names of the tensors that the checkpoint or the policy lacks, or whose shapes or types differ.
     """
 
     def __init__(self, folder: Path, names: Sequence[str]) -> None:
@@ -62,7 +62,7 @@ def load_policy(
     Args:
         folder: Folder of the checkpoint.
         extend: Function that adds modules, such as adapters, to a plain policy before its tensors are loaded.
-        name: Name of the policy, whose kind the checkpoint must have. None stands for any built-in one: a
+        name: Name of the policy, whose kind the checkpoint must have. None allows any built-in kind: a
             checkpoint never decides which module is imported.
 
     Raises:
@@ -94,7 +94,7 @@ def _kinds(tensors: Mapping[str, Tensor]) -> dict[str, tuple[Any, ...]]:
 
 
 def _fault(config: PolicyConfig, tensors: Mapping[str, Tensor], kind: str | None) -> str | None:
-    """Return why a policy of these sizes must not be built, None if it may: it could exceed the memory."""
+    """Return why a policy of these sizes must not be built, for example for lack of memory, else None."""
     sizes = dataclasses.asdict(config)
     allowed = list(POLICIES) if kind is None else [kind]
     if sizes.pop("kind") not in allowed:

@@ -50,7 +50,7 @@ class Thresholds:
     """When the pipeline takes a token and begins a block; the defaults are the paper's.
 
     Raises:
-        InputError: `add` or `activate` is not a share below 1, which a complete block exceeds.
+        InputError: `add` or `activate` is not a share below 1: a complete block must exceed both.
     """
 
     confidence: float = 0.5
@@ -61,7 +61,7 @@ class Thresholds:
     """Share of a block's tokens above which the next one takes a part of its tokens at each forward, however
     sure they are (tau_act)."""
     part: int = 2
-    """The least part of the masked tokens that such a block takes is one in `part` (n)."""
+    """Such a block takes at least one in `part` of its masked tokens at each forward (n)."""
 
     def __post_init__(self) -> None:
         check_share(self, "add", "activate")
@@ -95,8 +95,8 @@ def easy_first(
 ) -> Tensor:
     """Return the tokens (B, H * A) after `steps` forwards, each of which keeps the surest predictions.
 
-    After forward s, floor(L cos(pi / 2 * s / steps)) of the L tokens are still masked. One step takes the
-    likeliest token everywhere. `work` receives the forwards.
+    After forward s, floor(L cos(pi / 2 * s / steps)) of the L tokens are still masked. With a single step,
+    every token is the likeliest one. `work` receives the forwards.
     """
     length = head.length
     tokens = torch.full((len(mask), length), head.bins, device=mask.device)
@@ -127,8 +127,8 @@ def pipelined(
         hidden: Hidden states of the backbone, one (B, P, W) per layer.
         mask: Mask of the prefix tokens that are read, (B, 1, 1, P).
         thresholds: When tokens are taken and blocks begin.
-        block: Steps of a block: those of the head's attention if None, or the chunk if it has no blocks. A
-            head without blocks may be given some if `cached`: its kept keys are then stale.
+        block: Steps of a block. None means the blocks of the head's attention, or the whole chunk if it has
+            no blocks. If `cached`, a head without blocks may be given some: its kept keys are then stale.
         cached: Whether the keys and values of complete blocks are kept; chunks are then decoded one by one.
         work: Receives the forwards.
     """
@@ -207,7 +207,7 @@ class Blocks:
         self._look()
 
     def _look(self) -> None:
-        """Look at the tokens again after some were taken."""
+        """Count the masked tokens of each block again, after some were taken."""
         self.masked = (self.tokens == self.bins).view(-1, *self.shape)
         left = self.masked.sum(dim=2)
         self.left = left
@@ -222,11 +222,11 @@ class Blocks:
 
     @property
     def end(self) -> int:
-        """Place after the last token that has begun in any chunk."""
+        """Place after the last token of the blocks that have begun in any chunk."""
         return int(self.begun.max()) * self.shape[1]
 
     def add(self) -> None:
-        """Begin the next block of each chunk whose last one is far enough, and fully activate blocks."""
+        """Begin the next block of each chunk whose last block is far enough, and fully activate blocks."""
         last = self.share.gather(1, self.begun - 1)
         self.begun += (last > self.thresholds.add) & (self.begun < self.shape[0])
         follows = self.share[:, :-1] > self.thresholds.activate

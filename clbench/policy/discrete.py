@@ -33,7 +33,7 @@ from clbench.policy.decoding import Decoder, easy_first, pipelined
 from clbench.policy.head import ActionHead
 
 LEAST_REACH = 0.01
-"""Actions that stay below it, a hundredth of the greatest, do not use their dimension."""
+"""Reach of the actions below which a dimension counts as unused, a hundredth of the greatest action."""
 
 
 class DiscreteDiffusionHead(ActionHead):
@@ -110,7 +110,7 @@ class DiscreteDiffusionHead(ActionHead):
         return cast(Tensor, self.embed(tokens) + places[:, first : first + tokens.shape[1]])
 
     def readable(self, mask: Tensor, first: int = 0, end: int | None = None) -> Tensor:
-        """Return what the tokens `first` to `end` of a chunk read: (B, 1, end - first or 1, P + end).
+        """Return the mask of what tokens `first` to `end` of a chunk read: (B, 1, end - first or 1, P + end).
 
         Args:
             mask: Mask of the prefix tokens that are read, (B, 1, 1, P).
@@ -193,6 +193,6 @@ class DiscreteDiffusionHead(ActionHead):
         return cast(Tensor, self.bin_out(embedded)), after
 
     def sample(self, noise: Tensor, hidden: list[Tensor], mask: Tensor) -> Tensor:
-        """Return the normalised action chunk (B, H, A) that is decoded; the noise is ignored."""
+        """Return the decoded, normalised action chunk (B, H, A); the noise is ignored."""
         tokens = self.decoder(self, hidden, mask).view(-1, self.chunk, self.action_size, 1)
         return self.centres().expand(len(tokens), self.chunk, -1, -1).gather(3, tokens).squeeze(3)

@@ -7,8 +7,8 @@ Two things differ from pi0:
 
 1. Flow times are not cut off near the action: t = 0 occurs.
 2. Steps of a chunk that do not count, after the end of an episode and after action noise, have no loss. But
-   in training the others attend to them, noisy as all are: the last action repeated, or actions for other
-   states than the chunk leads to. When the policy acts, no step is of this kind.
+   in training the other steps attend to them. Like all steps they carry noise; they hold the last action
+   repeated, or actions for states that the chunk does not lead to. When the policy acts, there are none.
 """
 
 from __future__ import annotations

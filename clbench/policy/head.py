@@ -17,12 +17,12 @@ class ActionHead(nn.Module, ABC):
 
     @abstractmethod
     def fit(self, action: Tensor, mean: Tensor, std: Tensor) -> None:
-        """Set what depends on the actions of pretraining.
+        """Set the values of the head that depend on the actions of pretraining.
 
         Args:
             action: Actions in the units of the world, (N, A).
-            mean: Action that becomes 0 by the policy's normalisation, (A,).
-            std: Difference that becomes 1, (A,).
+            mean: Action that the policy's normalisation maps to 0, (A,).
+            std: Difference of actions that it maps to 1, (A,).
         """
 
     @abstractmethod

@@ -42,8 +42,8 @@ def check_abilities(kind: str, needs: Iterable[str], method: str) -> None:
 
     Raises:
         UnknownNameError: The method needs an ability that does not exist, or the policy declares one.
-        WrongTypeError: The abilities of the policy are no set.
-        InputError: The policy lacks some of them.
+        WrongTypeError: The abilities of the policy are not a set.
+        InputError: The policy lacks some of the abilities.
     """
     offered = policy_class(kind).abilities
     if not isinstance(offered, frozenset | set):

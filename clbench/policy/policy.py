@@ -1,4 +1,4 @@
-"""The policy protocol: what methods, evaluation and pretraining need of a policy."""
+"""The policy protocol: what methods, evaluation and pretraining need from a policy."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ABILITIES = ("hidden_states", "answers")
 
 
 class MissingAbilityError(ClbenchError, TypeError):
-    """A policy does not offer what was asked of it."""
+    """A policy lacks an ability that its caller needs."""
 
 
 @dataclass(frozen=True)
@@ -62,10 +62,10 @@ class PolicyConfig:
 class Policy(nn.Module, ABC):
     """A policy: state, image and words in, action chunks out, and answers if it has that ability.
 
-    A subclass takes `config` and `seed`, draws its initial weights from the seed alone, and has the abstract
-    methods. B samples have states (B, S), words (B, L) and chunks of H actions (B, H, A) in the units of the
-    world. All draws come with the samples: equal policies have equal losses on the same batch. If a policy
-    sees images, each function that takes states also takes images, uint8 (B, N, N, 3).
+    A subclass takes `config` and `seed`, draws its initial weights from the seed alone, and implements the
+    abstract methods. B samples have states (B, S), words (B, L) and chunks of H actions (B, H, A) in the
+    units of the world. All draws come with the samples: equal policies have equal losses on the same batch.
+    If a policy sees images, each function that takes states also takes images, uint8 (B, N, N, 3).
 
     Abilities are optional. A method names those that it needs in `needs`, and runs with no other policy.
 
@@ -82,20 +82,20 @@ class Policy(nn.Module, ABC):
     """
 
     abilities: ClassVar[frozenset[str]] = frozenset()
-    """Abilities that the policy has, of `ABILITIES`."""
+    """Abilities that the policy has, from `ABILITIES`."""
     pretrained: ClassVar[bool] = False
     """Whether a new policy has pretrained weights of its own, which clbench then uses as they are."""
     head: nn.Module
-    """The action head, whose parameters belong to the policy; with the ability "hidden_states"."""
+    """The action head, whose parameters belong to the policy; needed for the ability "hidden_states"."""
 
     state_mean: Tensor
-    """Mean of the states that `normalise_like` got, (S,), in the units of the world; 0 before."""
+    """Mean of the states given to `normalise_like`, (S,), in the units of the world; 0 before the call."""
     state_std: Tensor
-    """Their standard deviation, (S,), at least 0.01; 1 before."""
+    """Standard deviation of these states, (S,), at least 0.01; 1 before the call."""
     action_mean: Tensor
-    """Mean of the actions that `normalise_like` got, (A,), in the units of the world; 0 before."""
+    """Mean of the actions given to `normalise_like`, (A,), in the units of the world; 0 before the call."""
     action_std: Tensor
-    """Their standard deviation, (A,), at least 0.01; 1 before."""
+    """Standard deviation of these actions, (A,), at least 0.01; 1 before the call."""
 
     def __init__(self, config: PolicyConfig, seed: int = 0) -> None:
         super().__init__()
@@ -106,7 +106,7 @@ class Policy(nn.Module, ABC):
 
     @property
     def device(self) -> torch.device:
-        """Device on which the policy is computed."""
+        """Device on which the policy computes."""
         return self.state_mean.device
 
     def normalise_like(self, state: Tensor, action: Tensor | None = None) -> None:
@@ -122,14 +122,14 @@ class Policy(nn.Module, ABC):
     def action_loss(self, batch: Batch, hidden: list[Tensor] | None = None) -> Tensor:
         """Return the loss of each sample, (B,), on demonstrated action chunks.
 
-        A flow head has the mean squared error of its velocities, `(predict(batch) - (noise - action)) ** 2`
-        with normalised actions, over the dimensions of the valid actions. A discrete-diffusion head has the
-        mean cross-entropy of the masked tokens of the valid actions.
+        A flow head's loss is the mean squared error of velocities over the dimensions of the valid actions:
+        `(predict(batch) - (noise - action)) ** 2`, with normalised actions. The loss of a discrete-diffusion
+        head is the mean cross-entropy of the masked tokens of the valid actions.
 
         Args:
             batch: Demonstrated action chunks.
             hidden: Hidden states to use instead of `hidden_states(batch.state, batch.words, batch.image)`:
-                detached ones stop the gradient at the backbone. Given only with the ability "hidden_states".
+                detached ones stop the gradient at the backbone. They need the ability "hidden_states".
         """
 
     @abstractmethod
@@ -175,7 +175,7 @@ class Policy(nn.Module, ABC):
         return F.cross_entropy(logits, questions.answer, reduction="none")
 
     def vision_to_pretrain(self) -> Vision | None:
-        """Return the module that is pretrained on pictures before the policy is, None without one."""
+        """Return the module that is pretrained on pictures before the policy, None if there is none."""
         return None
 
     def _lacks(self, ability: str) -> MissingAbilityError:

@@ -17,7 +17,7 @@ from clbench.policy.policy import Policy, PolicyConfig
 from clbench.policy.vision import Vision
 
 LARGEST_STATE = 10.0
-"""Normalised numbers of a state are clipped at this many deviations of the demonstrations, on both sides."""
+"""Normalised states are clipped at this many standard deviations of the demonstrations, on both sides."""
 
 
 def new_head(config: PolicyConfig) -> ActionHead:
@@ -64,7 +64,7 @@ class TransformerPolicy(Policy):
         return list(self.backbone.layers)
 
     def normalise_like(self, state: Tensor, action: Tensor | None = None) -> None:
-        """Set the normalisation, and what the head needs of the actions."""
+        """Set the normalisation, and fit the head to the actions."""
         super().normalise_like(state, action)
         if action is not None:
             self.head.fit(action, self.action_mean, self.action_std)

@@ -1,4 +1,4 @@
-"""The client of a served policy: it connects again when the connection is lost, and limits the time."""
+"""The client of a served policy: it reconnects when the connection is lost, and limits waiting times."""
 
 from __future__ import annotations
 
@@ -27,35 +27,35 @@ from clbench.serving.server import LARGEST_MESSAGE, TOKEN, Observations, bearer,
 LOG = logging.getLogger("clbench")
 
 ATTEMPTS = 5
-"""Connections that one request may lose: a request that ends the server would do so forever."""
+"""Most connections that one request may lose: a request that crashes the server would do so forever."""
 
 REMINDER_SECONDS = 60.0
 """Seconds between two messages about a server that does not answer."""
 
 LONGEST_ERROR = 100_000
-"""Characters of an error of the server that are looked at: it may send 256 MB."""
+"""Most characters to read of an error from the server, which may send 256 MB."""
 
 MOST_NAMES = 20
-"""Entries of a reply that a message names."""
+"""Most entries of a reply that a message names."""
 
 _LOST = (ConnectionClosed, InvalidHandshake, OSError)
-"""Errors of a connection that another attempt may not have; a handshake out of time is an OSError."""
+"""Errors of a connection that may not recur at the next attempt; a late handshake is an OSError."""
 
 
 class ServedPolicy:
     """A policy that a server offers, as a function from observations to chunks of actions.
 
-    A request that is interrupted is sent again: its reply depends on nothing else. The environment variable
+    An interrupted request is sent again: a reply depends on its request alone. The environment variable
     CLBENCH_POLICY_TOKEN holds the token that a server asks for.
 
     Args:
         address: Address of the server, for example "ws://localhost:8000".
-        timeout: Seconds that a reply may take; a first one may include compilation.
+        timeout: Seconds that a reply may take; the first one may include compilation.
         patience: Seconds to wait for a server that cannot be reached; loading a large policy takes minutes.
 
     Raises:
-        InputError: The address is no address, no server answers in time, or it speaks another protocol, the
-            token is wrong or missing, or cannot be one.
+        InputError: The address is invalid, no server answers in time, the server speaks another protocol, or
+            the token is missing, wrong or invalid.
     """
 
     def __init__(self, address: str, timeout: float = 300.0, patience: float = 600.0) -> None:
@@ -68,7 +68,7 @@ class ServedPolicy:
         self._opened = ExitStack()
         self._greeting: dict[Any, bytes] | None = None
         self.metadata: dict[str, Any] = {}
-        """What the server says about itself."""
+        """Metadata that the server has sent about itself."""
         self._connected()
 
     def __call__(self, observations: Observations) -> NDArray[Any]:
@@ -94,7 +94,7 @@ class ServedPolicy:
         )
 
     def close(self) -> None:
-        """End the connection; the next request makes another."""
+        """End the connection; the next request opens a new one."""
         self._connection = None
         self._opened.close()
 
@@ -160,10 +160,10 @@ class ServedPolicy:
         return connection
 
     def _send(self, connection: ClientConnection, request: bytes) -> None:
-        """Send a request; a server that does not read it would make the program wait forever.
+        """Send a request in limited time: a server that never reads it would make the program wait forever.
 
         Raises:
-            InputError: The server does not read it in time.
+            InputError: The server does not read the request in time.
         """
         ended = threading.Event()
 
@@ -195,7 +195,7 @@ class ServedPolicy:
         """Return the next message of the server.
 
         Raises:
-            InputError: It is an error of the policy, cannot be read, or does not arrive in time.
+            InputError: The message is an error of the policy, cannot be read, or does not arrive in time.
         """
         try:
             message = connection.recv(timeout=self._timeout)
@@ -233,17 +233,17 @@ def _is_address(text: str) -> bool:
     """Return whether websockets accepts an address; its own error would show the password."""
     try:
         return parse_uri(text).port != 0
-    except (InvalidURI, ValueError):  # the port is no number, or a password is no UTF-8
+    except (InvalidURI, ValueError):  # the port is not a number, or a password is not UTF-8
         return False
 
 
 def _without_password(address: str) -> str:
-    """Return an address without user and password, also if it is damaged: a password may hold any sign."""
+    """Return an address without user and password, even a damaged one: passwords hold any character."""
     return re.sub(r"^(\w+://)?.*@", r"\1", address, flags=re.DOTALL)
 
 
 def _headers(address: str) -> dict[str, str]:
-    """Return the headers of a connection: the token of the environment, if there is one.
+    """Return the headers of a connection: the token from the environment variable, if it is set.
 
     Raises:
         InputError: A header cannot hold the token, or the address has a password for the same header.
@@ -267,7 +267,7 @@ def _reason(error: BaseException) -> str:
 
 
 def _names(reply: dict[Any, Any]) -> str:
-    """Return the names of a reply's entries, the first ones if there are many."""
+    """Return the names of a reply's entries, only the first ones if there are many."""
     names = [shortened(str(name)[:LONGEST_ERROR], "the reply") for name in islice(reply, MOST_NAMES)]
     more = len(reply) - len(names)
     return ", ".join([*names, f"and {more:,} more"] if more else names)

@@ -1,6 +1,6 @@
 """Score a policy that was fine-tuned elsewhere: stage by stage, on the test episodes of every run.
 
-Its record has the division `external`: how the policy was trained is declared by its authors, and not known.
+Its record has the division `external`: the authors declare how the policy was trained; clbench cannot know.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from clbench.spec.registry import load_scenario
 LOG = logging.getLogger("clbench")
 
 MOST_METADATA = 20
-"""Entries of a server's metadata that a record keeps."""
+"""Most entries of a server's metadata that a record keeps."""
 
 LONGEST_METADATA = 200
-"""Characters of a name or text in them."""
+"""Length limit of a name or text in the kept metadata, in characters."""
 
 
 def is_scored(
@@ -51,7 +51,7 @@ def is_scored(
     restart: bool = False,
     records: Path | str = RECORDS,
 ) -> bool:
-    """Return whether a stage has been scored and need not be; the arguments are those of `score`.
+    """Return whether a stage has been scored already; the arguments are those of `score`.
 
     Raises:
         InputError: An earlier stage comes first, there is no such stage, the stage was scored with other
@@ -96,7 +96,7 @@ def score(
 ) -> Record:
     """Evaluate a policy at the end of a stage, and write the record after the last stage.
 
-    Until then the record is beside its final place, in a file that ends with `.json.unfinished`: an
+    Until then the record lies beside its final place, in a file whose name ends with `.json.unfinished`: an
     interrupted program loses only the stage that was running.
 
     Args:
@@ -109,12 +109,12 @@ def score(
         seed: Seed of the run; it chooses the initial states, the same for all methods. From 100 on,
             validation episodes are played.
         executed: Actions of a chunk that are executed before the policy acts again, the same number in all
-            stages. If None, all: chunks must then have one length in all stages.
+            stages. None executes all of them: chunks must then have one length in all stages.
         data: What the policy was trained on in this stage, in words.
         steps: Optimiser steps of the stage.
         pictures: Cameras of the simulator whose pictures the policy gets, the same in all stages.
         picture_size: Height and width of these pictures in pixels.
-        restart: Score the stage although it was scored: it is dropped, and later ones with it.
+        restart: Score the stage again if it was scored: its old scores and those of later stages are dropped.
         records: Folder of the records.
         progress: Called with the share of the stage's episodes that have ended since its last call.
 
@@ -122,12 +122,12 @@ def score(
         The record so far. Base no choice on test episodes; choose with a seed from 100 on.
 
     Raises:
-        InputError: Another stage comes next, a record exists already, `executed` is not that of stage 0, the
+        InputError: Another stage comes next, a record exists already, `executed` differs from stage 0, the
             earlier stages had another version of the scenario or its simulator, or other pictures, the
             actions have the wrong shape, or a name or number is invalid.
         UnknownNameError: A scene has no such camera.
         RenderingError: This machine cannot draw the pictures.
-        WrongTypeError: `data` is no text.
+        WrongTypeError: `data` is not a text.
     """
     executed, steps = whole_number("executed", executed, 1), whole_number("steps", steps, 0)
     stage = int(stage) if is_whole(stage) else stage  # of NumPy, which JSON cannot hold
@@ -170,7 +170,7 @@ def score(
 def _settings(
     run: StagedRun, stage: int, restart: bool, executed: int | None, views: Views
 ) -> dict[str, Any] | None:
-    """Return the settings of a stage: pictures are those of this call, `executed` may be that of stage 0."""
+    """Return the settings of a stage: pictures come from this call, `executed` may come from stage 0."""
     before = run.plan(stage, restart) if stage else None
     known = before.run.settings.get("executed") if before else None
     chosen = {"executed": known if executed is None else executed, **views.settings}
@@ -178,7 +178,7 @@ def _settings(
 
 
 def _warn_if_known(server: Mapping[str, Any], record: Record, run: StagedRun, stage: int) -> None:
-    """Say if a server says the same about itself as in the stage before, or as with another seed."""
+    """Warn if a server sends the same metadata as in the stage before, or as with another seed."""
     if server == record.diagnostics.get(str(stage - 1), {}).get("server"):
         LOG.warning(
             "The server sends the same metadata as in stage %d (%s): does it serve the new checkpoint?",
@@ -196,7 +196,7 @@ def _warn_if_known(server: Mapping[str, Any], record: Record, run: StagedRun, st
 
 
 def _warn_if_unchanged(record: Record, stage: int) -> None:
-    """Say if all episodes ended as in the stage before: an unchanged policy repeats itself exactly."""
+    """Warn if all episodes ended as in the stage before: an unchanged policy repeats itself exactly."""
     names = ("stage", "task", "split", "episode", "success", "length")
     outcomes: dict[int, dict[tuple[Any, ...], tuple[Any, ...]]] = {}
     for one, *place, success, length in zip(*(record.episodes[name] for name in names), strict=True):
@@ -213,7 +213,7 @@ def _warn_if_unchanged(record: Record, stage: int) -> None:
 
 
 def _seeds_of(server: Mapping[str, Any], run: StagedRun, stage: int) -> list[int]:
-    """Return the other seeds of a row whose server said the same about itself in a stage."""
+    """Return the other seeds of a row whose server sent the same metadata in a stage."""
     found = set()
     for path in (*run.path.parent.glob("seed-*.json"), *run.path.parent.glob(f"seed-*.json{UNFINISHED}")):
         with contextlib.suppress(RecordError):  # the board names a damaged one
@@ -224,12 +224,12 @@ def _seeds_of(server: Mapping[str, Any], run: StagedRun, stage: int) -> list[int
 
 
 def described(server: Mapping[str, Any]) -> str:
-    """Return metadata that a record keeps in one line."""
+    """Return, in one line, the metadata that a record keeps."""
     return ", ".join(f"{name} {value}" for name, value in server.items())
 
 
 def _kept_metadata(metadata: object) -> dict[str, Any]:
-    """Return what a record keeps of metadata: texts and finite numbers, without control characters."""
+    """Return the metadata that a record keeps: texts and finite numbers, without control characters."""
     plain: dict[str, Any] = {}
     for name, value in metadata.items() if isinstance(metadata, Mapping) else ():
         found = value.item() if isinstance(value, np.generic) else value
@@ -242,7 +242,7 @@ def _kept_metadata(metadata: object) -> dict[str, Any]:
 
 
 def _warn(stage: int, played: ChunkPlay) -> None:
-    """Name the actions that were replaced: they are most often a fault of the program, not of the policy."""
+    """Warn of actions that were replaced: they are most often a fault of the program, not of the policy."""
     found = [
         f"{100 * share:.3g} % of the steps had an action {what}"
         for share, what in (

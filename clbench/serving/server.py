@@ -13,8 +13,8 @@ of each episode. Its observations are a dictionary:
 - `image`: uint8 (B, N, N, 3), only where the task has a camera;
 - `pictures/<camera>`: uint8 (B, N, N, 3), upright, for each camera of `clbench score --pictures`;
 - `instruction`: B texts;
-- `seed`: int64 (B,), a seed for each episode, and `step`: int64 (B,), the steps taken in it. Draw noise from
-  both alone, and the outcomes repeat themselves.
+- `seed`: int64 (B,), a seed for each episode, and `step`: int64 (B,), the steps taken in it. If you draw
+  noise from these two alone, the outcomes repeat themselves.
 
 Rows are independent: an episode has no fixed row, and unused rows repeat the first one. A policy with a
 memory keeps it by `seed`, which names the episode, and returns one action at a time; `step` 0 begins an
@@ -67,7 +67,7 @@ TOKEN = "CLBENCH_POLICY_TOKEN"
 """Environment variable in which `clbench score` looks for the token of a server."""
 
 LARGEST_MESSAGE = 256 * 2**20
-"""Bytes of the largest request that is read: 40 episodes with pictures of 1,400 x 1,400 pixels."""
+"""Size limit of a request in bytes: 40 episodes with pictures of 1,400 x 1,400 pixels."""
 
 _DTYPE = re.compile(r"[<>=|]?[A-Za-z?]{1,16}\d{0,10}(?:\[\w{1,16}\])?", re.ASCII)
 """Form of the name of a type: NumPy takes 10 s to read a name of 50,000 parts that commas separate."""
@@ -88,10 +88,10 @@ def lerobot_policy(
     The batch that `preprocess` receives has `observation.state`, float32 (B, S), `task`, a list of B texts,
     and with a camera `observation.images.<camera>`, float32 (B, 3, N, N) from 0 to 1, as for each camera of
     `clbench score --pictures`. Without a camera it has the state as `observation.environment_state`, too: ACT
-    refuses to go without both. `postprocess` receives the actions (B, A) of one step after another, as in
+    needs one of the two. `postprocess` receives the actions (B, A) of one step after another, as in
     LeRobot's own server. Without `noise`, a policy draws from PyTorch's generator, which is seeded before
     each call by all seeds and steps together: the same request has the same reply, but the noise of an
-    episode depends on the other ones in its request.
+    episode depends on the other episodes in its request.
 
     Args:
         policy: A `PreTrainedPolicy` whose `predict_action_chunk` needs no earlier observations: ACT, or
@@ -123,7 +123,7 @@ def lerobot_policy(
             drawn["noise"] = values.to(next(policy.parameters()).device)
         with torch.no_grad():
             chunks = policy.predict_action_chunk(preprocess(batch), **drawn)
-            # LeRobot executes so many actions of a chunk, then the policy acts again
+            # LeRobot executes this many actions of a chunk before the policy acts again
             executed = getattr(policy.config, "n_action_steps", chunks.shape[1])
             steps = [postprocess(chunks[:, step]) for step in range(min(executed, chunks.shape[1]))]
             actions: NDArray[Any] = torch.stack(steps, dim=1).float().cpu().numpy()
@@ -133,7 +133,7 @@ def lerobot_policy(
 
 
 def _noise(seed: Any, step: Any, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Return the noise that an episode starts a chunk from."""
+    """Return the noise from which a chunk of an episode starts."""
     return np.random.default_rng([int(seed), int(step)]).standard_normal(shape, np.float32)
 
 
@@ -157,8 +157,8 @@ def openpi_policy(
 ) -> Policy:
     """Return a policy that takes one observation at a time, such as openpi's, as a function of observations.
 
-    Nothing of openpi is needed. The state is that of the scenario, and the policy's input transform must not
-    ask for more than it gets: openpi's `LiberoInputs` also wants a picture of the wrist, which `clbench score
+    openpi need not be installed. The state is the scenario's, and the policy's input transform must not need
+    more than it gets: openpi's `LiberoInputs` also needs a picture of the wrist, which `clbench score
     --pictures` gives under the camera's name.
 
     Args:
@@ -208,19 +208,19 @@ def serve(
 ) -> None:
     """Serve a policy until the program is interrupted.
 
-    Programs on this machine can use the policy, but no page in a browser.
+    Programs on this machine can use the policy, but web pages in a browser cannot.
 
     Args:
-        policy: The policy. It is called by one request at a time, in another thread: what holds for one
-            thread alone, such as `torch.inference_mode()` and `torch.autocast()`, belongs inside it.
+        policy: The policy. It is called by one request at a time, in another thread: settings of one thread
+            alone, such as `torch.inference_mode()` and `torch.autocast()`, belong inside it.
         host: Address to listen on. "0.0.0.0" lets any machine that reaches this one use the policy.
         port: Port to listen on; 0 lets the system choose one, which is printed.
-        metadata: What clients receive first, texts and numbers, for example the name of a checkpoint.
+        metadata: Texts and numbers that clients receive first, for example the name of a checkpoint.
         token: Secret that a client must send; None serves every client.
 
     Raises:
-        ValueError: The token is empty, or has spaces or other characters than those of ASCII.
-        SystemExit: The address cannot be listened on, for example because another program does.
+        ValueError: The token is empty, or has spaces or characters outside ASCII.
+        SystemExit: The server cannot listen on the address, for example because another program does.
     """
     try:
         server = open_server(policy, host, port, metadata, token)
@@ -254,7 +254,7 @@ def open_server(
             for message in connection:
                 try:
                     with lock:
-                        # it waited for others: if its client has given up, nobody reads the reply
+                        # the request waited for others: if its client has given up, nobody reads the reply
                         if connection.protocol.state is not State.OPEN:
                             return
                         reply = _answer(policy, message)
@@ -329,15 +329,15 @@ def pack(values: Any) -> bytes:
     """Return a message: msgpack, with NumPy arrays and scalars as openpi encodes them.
 
     Raises:
-        TypeError: It holds what msgpack cannot.
-        ValueError: It holds an array of objects, structures or complex numbers.
+        TypeError: A value has a type that msgpack cannot hold.
+        ValueError: A value is an array of objects, structures or complex numbers.
     """
     message: bytes = msgpack.packb(values, default=_encode)
     return message
 
 
 def unpack(message: bytes) -> Any:
-    """Return what a message holds; its arrays are copies that may be written to.
+    """Return the content of a message; its arrays are copies that may be written to.
 
     Raises:
         ValueError: The message is damaged, or holds an array of objects, structures or complex numbers.
@@ -377,7 +377,7 @@ def _dtype(name: Any) -> np.dtype[Any]:
 
 
 def _plain_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """Return a type, unless its values are objects, structures or complex numbers, as openpi does."""
+    """Return a type, but refuse one of objects, structures or complex numbers, as openpi does."""
     if dtype.kind in "OVc":
         raise ValueError(f"A message cannot hold values of the type {dtype}.")
     return dtype

@@ -1,4 +1,4 @@
-"""Checks of values, most of them fields of a dataclass, so that a wrong one is named where it is written."""
+"""Checks of values, most of them dataclass fields: a wrong value is reported where it is written."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from clbench.base.errors import InputError, WrongTypeError
 from clbench.base.text import quoted
 
 LONGEST = 100
-"""Largest number of characters of a name."""
+"""Length limit of a name, in characters."""
 
 
 def is_whole(value: Any) -> bool:
-    """Return whether a value is a whole number, of Python or of NumPy; True and 1.0 are none."""
+    """Return whether a value is a whole number of Python or NumPy; True and 1.0 are not."""
     return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
 def whole_number(name: str, value: int | None, least: int) -> int | None:
-    """Return a whole number, of Python or of NumPy, as Python's, which JSON can hold; None stays None.
+    """Return a whole number of Python or NumPy as a Python int, which JSON can hold; None stays None.
 
     Raises:
-        InputError: It is no whole number, or below `least`.
+        InputError: The value is not a whole number, or is below `least`.
     """
     if value is None:
         return None
@@ -34,10 +34,10 @@ def whole_number(name: str, value: int | None, least: int) -> int | None:
 
 
 def check_whole(part: object, least: int, *fields: str, most: int | None = None) -> None:
-    """Check that fields of `part` are whole numbers from `least` to `most`, or without an upper bound.
+    """Check that fields of `part` are whole numbers from `least` to `most`; None sets no upper bound.
 
     Raises:
-        WrongTypeError: A field is no whole number.
+        WrongTypeError: A field is not a whole number.
         InputError: A field is too small or too large.
     """
     for name in fields:
@@ -51,7 +51,12 @@ def check_whole(part: object, least: int, *fields: str, most: int | None = None)
 
 
 def check_positive(part: object, *fields: str) -> None:
-    """Check that fields of `part` are finite numbers above 0."""
+    """Check that fields of `part` are finite numbers above 0.
+
+    Raises:
+        WrongTypeError: A field is not a number.
+        InputError: A field is not above 0, or not finite.
+    """
     for name in fields:
         check_number(part, name)
         if not 0 < getattr(part, name) < math.inf:
@@ -59,7 +64,12 @@ def check_positive(part: object, *fields: str) -> None:
 
 
 def check_share(part: object, *fields: str) -> None:
-    """Check that fields of `part` are numbers from 0 to 1."""
+    """Check that fields of `part` are numbers from 0 to 1.
+
+    Raises:
+        WrongTypeError: A field is not a number.
+        InputError: A field is outside of this range.
+    """
     for name in fields:
         check_number(part, name)
         if not 0 <= getattr(part, name) <= 1:
@@ -67,10 +77,10 @@ def check_share(part: object, *fields: str) -> None:
 
 
 def check_tuple(part: object, kind: type, *fields: str) -> None:
-    """Check that fields of `part` are tuples whose entries are all of a kind.
+    """Check that fields of `part` are tuples whose entries are all of the type `kind`.
 
     Raises:
-        WrongTypeError: A field is no tuple, or has another entry.
+        WrongTypeError: A field is not a tuple, or has an entry of another type.
     """
     entry = "text" if kind is str else kind.__name__
     for name in fields:
@@ -87,7 +97,7 @@ def check_entry_point(part: object, *fields: str) -> None:
     """Check that fields of `part` are texts of the form "module:attribute".
 
     Raises:
-        WrongTypeError: A field is no text, but perhaps the object itself.
+        WrongTypeError: A field is not a text but, for example, the object itself.
         InputError: A text has another form.
     """
     for name in fields:
@@ -106,7 +116,7 @@ def check_number(part: object, name: str) -> None:
     """Check that a field of `part` is a number.
 
     Raises:
-        WrongTypeError: It is not.
+        WrongTypeError: The field is not a number.
     """
     value = getattr(part, name)
     if not isinstance(value, int | float) or isinstance(value, bool):

@@ -19,7 +19,7 @@ from clbench.spec.fields import LONGEST
 from clbench.spec.policies import policy_names
 
 LONGEST_LABEL = 200
-"""Largest number of characters of a method with its changed settings; file systems allow 255."""
+"""Length limit of a method's name with its changed settings, in characters; file systems allow 255."""
 
 _IDENTIFIER = r"[A-Za-z_]\w*"
 _WORD = r"[A-Za-z0-9]\w*(?:[.-]\w+)*"
@@ -32,13 +32,13 @@ _CHANGES = re.compile(rf"(?:\+{_IDENTIFIER}=[\w .,()\[\]'+-]*[\w)\]'])*", re.ASC
 _PLAIN = re.compile(r"\w+(?:[.-]\w+)*", re.ASCII)
 
 _RESERVED = {"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))}
-"""Names of devices on Windows, whatever follows after a dot."""
+"""Names of devices on Windows, which are reserved whatever follows after a dot."""
 
 _ALIKE = str.maketrans("01i", "oll")
 
 
 def installed_methods() -> dict[str, EntryPoint]:
-    """Map names to entry points: our own names as they are, names of other packages as "package/name"."""
+    """Return the entry points of installed methods by name; a method of another package is "package/name"."""
     found = {}
     for entry in entry_points(group="clbench.methods"):
         package = entry.dist.name if entry.dist is not None else "unknown"
@@ -55,7 +55,7 @@ def built_in_methods() -> dict[str, EntryPoint]:
 def check_known(scenarios: Iterable[str], methods: Iterable[str]) -> None:
     """Refuse names that are not registered or installed; nothing is imported.
 
-    Names with their module, "module:id" and "module:Class", pass: only the import can tell.
+    Names with a module, "module:id" and "module:Class", pass: only an import can check them.
 
     Raises:
         UnknownNameError: Nothing has the name; the message names the nearest one.
@@ -149,11 +149,11 @@ def check_plain(kind: str, name: str) -> None:
     """Refuse a name with other characters than letters, digits, _, - and dots.
 
     Args:
-        kind: Kind of thing that it names, such as "task", for the message.
+        kind: Kind of thing that `name` names, such as "task", for the message.
         name: Name to check.
 
     Raises:
-        InputError: It has other characters, or too many.
+        InputError: The name has other characters, or too many.
     """
     if len(name) > LONGEST or not _PLAIN.fullmatch(name):
         raise InputError(f"{quoted(name)} cannot be the name of a {kind}: letters, digits, _, - and . only.")

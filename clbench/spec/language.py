@@ -20,14 +20,14 @@ if TYPE_CHECKING:  # PyTorch takes seconds to import, and environments do not ne
     from torch import Tensor
 
 LENGTHS = (12, 24, 48)
-"""Lengths of texts in tokens. A scenario has the shortest that all its texts fit, so that every forward has
-one shape."""
+"""Lengths of texts in tokens. A scenario uses the shortest one that all its texts fit, so that every forward
+has one shape."""
 
 TEXT_LENGTH = LENGTHS[0]
 """Length of the texts of the built-in scenarios."""
 
 VOCABULARY_SIZE = 1024
-"""Rows of the embedding and of the answers, more than there are words and pieces. A new suite appends its
+"""Rows of the embedding and of the answer layer; there are fewer words and pieces. A new suite appends its
 words to the vocabulary, which changes neither the shapes nor the initial weights of a policy."""
 
 PADDING = "[padding]"
@@ -129,7 +129,7 @@ def fitting_length(texts: tuple[str, ...]) -> int:
 
 
 def spelled_words(texts: Iterable[str]) -> list[str]:
-    """Return the words of texts that are not in the vocabulary, each once."""
+    """Return the words in `texts` that the vocabulary does not have, each once."""
     words = (word for text in texts for word, _ in _splitter().pre_tokenize_str(text.lower()))
     return [word for word in dict.fromkeys(words) if word not in vocabulary()]
 

@@ -11,11 +11,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a process and all that it starts. The defaults are far above the needs of our own runs."""
+    """Limits of a process and all processes that it starts. Our own runs need far less than the defaults."""
 
     seconds: float = 3600.0
     """Time since its start, in seconds."""
     memory: int = 8 * 1024**3
     """Resident memory at any one time, in bytes."""
     written: int = 4 * 1024**3
-    """Bytes handed to the system to write, wherever to. Not measured on macOS, which does not count them."""
+    """Bytes that the process asks the system to write, to any file. Not measured on macOS, which does not
+    count them."""

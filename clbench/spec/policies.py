@@ -1,7 +1,7 @@
-"""The policies by name: kinds and sizes.
+"""Names of policies: kinds and sizes.
 
-A name is a built-in kind, such as "flow", with a size other than the smallest after a dash, such as
-"flow-base"; or "module:Class", a class of one's own.
+A name is a built-in kind, such as "flow". A size other than the smallest follows after a dash, such as
+"flow-base". A class of your own has the name "module:Class".
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ POLICIES = {
 DEFAULT_POLICY = "flow"
 
 SIZES: dict[str, tuple[int, int] | None] = {"small": None, "base": (256, 4), "large": (512, 9)}
-"""Channels of a token, and layers of backbone and head, by size. The small one has the budget's: 0.7 million
-parameters on Fetch-v1, where base has 5 and large 40 million."""
+"""Channels of a token, and layers of backbone and head, by size. The small policy takes both from the budget.
+On Fetch-v1 it has 0.7 million parameters, base has 5 million and large 40 million."""
 
 SMALL = "small"
 
@@ -52,7 +52,7 @@ def kind_of(policy: str) -> str:
 
 
 def size_of(policy: str) -> tuple[int, int] | None:
-    """Return the channels and layers of a policy, None for those of the budget."""
+    """Return the channels and layers of a policy, None if the budget gives them."""
     return None if ":" in policy else SIZES[policy.partition("-")[2] or SMALL]
 
 
@@ -65,8 +65,8 @@ def check_policy_name(name: str) -> None:
     """Refuse a text that is neither the name of a built-in policy nor of the form "module:Class".
 
     Raises:
-        WrongTypeError: It is no text, but perhaps the class itself.
-        UnknownNameError: The message has the nearest name.
+        WrongTypeError: The name is not a text but, for example, the class itself.
+        UnknownNameError: No policy has this name; the message has the nearest one.
     """
     if not isinstance(name, str):
         raise WrongTypeError(f"A policy is given by a name, such as 'module:Class', not by {name!r}.")
@@ -88,7 +88,7 @@ def _unknown_policy(name: str) -> UnknownNameError:
 
 
 def policy_packages(policy: str) -> list[str]:
-    """Return the package, or module, of a policy that is not built in."""
+    """Return the package, or module, of a policy in a list, which is empty if the policy is built in."""
     return [] if is_built_in(policy) else [package_of(policy)]
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 Split = Literal["validation", "test", "perturbed"]
-"""Purpose of an episode. Choices may look at validation episodes; scores are made of test episodes alone. A
+"""Purpose of an episode. Choices may look at validation episodes; scores come from test episodes alone. A
 perturbed episode is the test episode of the same number in a perturbed world
 (`clbench.worlds.perturbation`)."""
 
@@ -23,17 +23,17 @@ ScoredSplit = Literal["test", "validation"]
 
 
 DEFAULT_SEEDS = 4
-"""Seeds of a method where no number is given. Four balance the orders of a balanced scenario of four targets;
-eight separate similar methods (docs/guide/statistics.md)."""
+"""Number of seeds per method if none is given. Four balance the orders of a balanced scenario of four
+targets; eight separate similar methods (docs/guide/statistics.md)."""
 
 MOST_SEEDS = 10_000
-"""Most seeds of one command: a typing error must not plan for hours."""
+"""Maximum number of seeds in one command: a typing error must not plan for hours."""
 
 LARGEST_SEED = 2**64 - 1
 """The largest seed: PyTorch takes no larger one, and records hold no larger number."""
 
 FIRST_TUNING_SEED = 100
-"""First seed of tuning: no board has it or a later one."""
+"""First seed of tuning: no board uses this seed or a later one."""
 
 EPISODE_WEIGHT = 0.3
 """Duration of an evaluation episode in optimiser steps, for the time left that a progress bar shows."""
@@ -62,12 +62,12 @@ class EpisodeKey(NamedTuple):
 def check_steps(last: int) -> tuple[int, ...]:
     """Return the steps of a stage at which its criterion is checked, rising.
 
-    The first check comes before any step, the last one after all. In between, checks are 2 steps apart up to
-    step 20, since targets are learned in 10 to 30 steps at the scenario's learning rate. Later ones are 12 %
-    apart, so that a longer stage is at most an eighth longer than it had to be.
+    The first check comes before any step, the last one after all steps. In between, checks are 2 steps apart
+    up to step 20, since targets are learned in 10 to 30 steps at the scenario's learning rate. Later checks
+    are 12 % apart, so that a longer stage is at most an eighth longer than it had to be.
 
     Args:
-        last: Most steps of a stage.
+        last: Maximum number of steps of a stage.
     """
     steps = [0]
     while steps[-1] < last:
@@ -113,7 +113,7 @@ class Protocol:
         return range(len(self.target) + 1)
 
     def end(self, stage: int) -> Point:
-        """Return the end of a stage, the latest possible one before a run with a criterion.
+        """Return the end of a stage; before a run with a criterion, return the latest possible end.
 
         Stage 0 has no steps and ends at step 0.
         """
@@ -159,12 +159,12 @@ class Protocol:
         return self.retained + self.learned(stage)
 
     def is_learned(self, successes: int) -> bool:
-        """Return whether so many successes in the validation episodes of a target meet the criterion."""
+        """Return whether this number of successes in a target's validation episodes meets the criterion."""
         return self.criterion is not None and successes >= self.goal
 
     @property
     def goal(self) -> int:
-        """Successes in the validation episodes of a target that meet the criterion."""
+        """Least number of successes in a target's validation episodes that meets the criterion."""
         assert self.criterion is not None
         return math.ceil(self.criterion * self.validation_episodes - 1e-9)
 

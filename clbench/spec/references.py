@@ -1,4 +1,4 @@
-"""Names of the methods that serve others for comparison."""
+"""Names of the methods that other methods are compared with."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ BASELINE = "sft"
 """Plain fine-tuning: the method that gain, relative cost and cards compare with."""
 
 JOINT = "joint"
-"""Training on everything met so far: the limit of a method with all the data."""
+"""Training on everything met so far: the limit for a method that has all the data."""
 
 FROZEN = "frozen"
 """The pretrained policy, never changed: the abilities before any target."""

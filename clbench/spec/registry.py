@@ -17,7 +17,7 @@ LOG = logging.getLogger("clbench")
 
 
 def register(scenario_id: str, entry_point: str) -> None:
-    """Register a scenario with Gymnasium, as one environment and as many side by side.
+    """Register a scenario with Gymnasium, as a single environment and as a vector environment.
 
     The scenario is imported and checked when it is first used.
 
@@ -53,12 +53,13 @@ def load_scenario(scenario_id: str) -> Scenario:
     Raises:
         UnknownNameError: No scenario is registered under this id.
         MissingPackageError: A package that its tasks need is not installed; the message says how to get it.
+        InputError: An instruction is too long or cannot be spelled, or a user's module raises an error.
     """
     return opened_scenario(registered_scenario(scenario_id))
 
 
 def importable(scenario_id: str) -> str:
-    """Return the name by which another process finds a scenario: "module:id" if the module of a user has it.
+    """Return the name by which another process finds a scenario: "module:id" if a user's module registers it.
 
     Args:
         scenario_id: Registered id, or already "module:id".
@@ -82,6 +83,7 @@ def registered_scenario(scenario_id: str) -> Scenario:
 
     Raises:
         UnknownNameError: No scenario is registered under this id.
+        InputError: An instruction is too long or cannot be spelled, or a user's module raises an error.
     """
     module, _, name = scenario_id.rpartition(":")
     if module:
@@ -96,7 +98,7 @@ def registered_scenario(scenario_id: str) -> Scenario:
 
 
 def opened_scenario(scenario: Scenario | str, order: int = 0) -> Scenario:
-    """Return a scenario, ready to use, with its targets in an order.
+    """Return a scenario, ready to use, with its targets in the given order.
 
     Args:
         scenario: Scenario, or its entry point "module:attribute".

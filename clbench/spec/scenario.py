@@ -46,10 +46,10 @@ class Scenario:
     questions: str
     """Entry point of a tuple of `QuestionKind`, the questions about a state."""
     background: tuple[Task, ...] = ()
-    """Tasks that the policy is pretrained on besides the skills, as a large model is on more than a benchmark
-    measures. No score counts them, and no method gets their demonstrations."""
+    """Tasks that the policy is pretrained on besides the skills, just as a large model is pretrained on more
+    than a benchmark measures. No score counts them, and no method gets their demonstrations."""
     scenes: tuple[Task, ...] = ()
-    """Tasks whose expert episodes give the states for the questions; empty for the retained tasks."""
+    """Tasks whose expert episodes give the states for the questions. If empty, the retained tasks do."""
     balanced: bool = False
     """Whether each seed learns the targets in its own order, see `balanced_order`, so that every target is
     learned in every position. If not, all seeds have the published order."""
@@ -116,7 +116,7 @@ class Scenario:
 
     @property
     def text_length(self) -> int:
-        """Length in tokens of every text that its policy reads: the shortest that all its texts fit."""
+        """Length in tokens of every text that the policy reads: the shortest one that all texts fit."""
         # imports the tokenizer and the questions, which a scenario that is only named does without
         from clbench.spec.language import fitting_length
 
@@ -220,7 +220,7 @@ def balanced_order(count: int, seed: int) -> tuple[int, ...]:
 def target_order(count: int, order: int) -> tuple[int, ...]:
     """Return, for each stage, the published place, from 0, of the target that it learns.
 
-    Order 0 is the published order. The others are distinct permutations, drawn at random once and for all.
+    Order 0 is the published order. Later orders are distinct permutations, drawn at random once and for all.
 
     Args:
         count: Number of targets.

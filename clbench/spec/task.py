@@ -37,7 +37,7 @@ class Task:
     action in a state. It must not remember earlier states: it also labels noisy demonstrations."""
     camera: str | None = None
     """Entry point of the `clbench.worlds.camera.Camera` through which a policy sees the world, for states
-    that hold more than a policy may know. None shows it the states."""
+    that hold more than a policy may know. With None the policy sees the states."""
     version: int = 0
     """Version, raised whenever the task, its expert or its demonstrations change."""
     action_noise: float = 0.1
@@ -46,9 +46,9 @@ class Task:
     """Distributions whose version can change a trajectory, besides those common to all worlds: the simulator
     of the suite, such as ("gymnasium-robotics",)."""
     test_instructions: tuple[str, ...] = ()
-    """Wordings of test episodes that training never shows; test episodes have those of training if empty."""
+    """Wordings for test episodes, which training never shows. If empty, test episodes use `instructions`."""
     seed_name: str | None = None
-    """Spelling of the suite in seeds and data set ids, where it differs from `suite`: it may never change, or
+    """Spelling of the suite in seeds and dataset ids, where it differs from `suite`. It may never change, or
     demonstrations and measurements would change with it."""
 
     def __post_init__(self) -> None:
@@ -78,12 +78,12 @@ class Task:
         return html_table(title, ("field", "value"), [row for row in rows if row[1] not in (None, ())])
 
     def wordings(self, split: Split) -> tuple[str, ...]:
-        """Return the wordings of the instruction in the episodes of a split, which take turns."""
+        """Return the wordings of the instruction that the episodes of a split use in turn."""
         return (split != "validation" and self.test_instructions) or self.instructions
 
     @property
     def seed_suite(self) -> str:
-        """Spelling of the suite in seeds and data set ids."""
+        """Spelling of the suite in seeds and dataset ids."""
         return self.seed_name or self.suite
 
     @property

@@ -1,4 +1,4 @@
-"""Tools for tests, ours and yours: a toy scenario with runs of seconds, and contract checks.
+"""Tools for tests, ours and yours: a toy scenario whose runs take seconds, and contract checks.
 
 Importing this package registers the toy as `clbench/Toy-v0`; "clbench.testing:clbench/Toy-v0" names it in a
 command.

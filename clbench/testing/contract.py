@@ -65,7 +65,7 @@ def check_method(cls: type[Method], *, policy: str = DEFAULT_POLICY, **settings:
         cls: Class of the method.
         policy: Name of the policy that it fine-tunes: "flow", "discrete_diffusion", or "module:Class" for one
             of your own.
-        settings: Hyper-parameters that differ from its defaults, to shorten a long preparation.
+        settings: Hyper-parameters that differ from its defaults, for example to shorten a long preparation.
 
     Raises:
         ContractError: The method breaks a clause; the message shows the expected and the actual behaviour,
@@ -192,7 +192,7 @@ def _check_tunes(cls: type[Method]) -> None:
 
 
 def _check_annotated(cls: type[Method]) -> None:
-    """Check that every plain value of the class is a hyper-parameter, or says that it is none."""
+    """Check that every plain value of the class is a hyper-parameter or is marked as a constant."""
     try:
         hints = get_type_hints(cls)
     except NameError as error:
@@ -423,7 +423,7 @@ def _breach(clause: Callable[[Subject], None], expected: str, found: str, look: 
 
 
 def _is_plain(value: object) -> bool:
-    """Return whether a record holds the value as it is: an infinite number becomes a text there."""
+    """Return whether a record can hold the value as it is; an infinite number would become a text."""
     try:
         json.dumps(value, allow_nan=False)
     except (TypeError, ValueError):

@@ -71,7 +71,7 @@ def read(settings: Mapping[str, _Setting]) -> dict[str, Any]:
 
 
 def same(one: Any, other: Any) -> bool:
-    """Return whether two values are equal, also arrays and tensors, alone and in tuples.
+    """Return whether two values are equal; they may be arrays and tensors, alone or in tuples.
 
     In a tensor, NaN equals NaN.
     """
@@ -88,7 +88,7 @@ def same(one: Any, other: Any) -> bool:
 
 @contextmanager
 def watched(found: list[str], *, generators: bool) -> Iterator[None]:
-    """Add a description of the side effects of the code inside to `found`, and restore the settings.
+    """Add descriptions of the side effects of the block to `found`, and restore the settings.
 
     Args:
         found: Receives a line for each setting that differs afterwards, and for each file outside
@@ -106,7 +106,7 @@ def watched(found: list[str], *, generators: bool) -> Iterator[None]:
                     found.append(_difference(name, before[name], after))
                     settings[name][1](before[name])
     cache = cache_folder()
-    # /dev/null, which silences a library, is no file
+    # /dev/null, which silences a library, is not a regular file
     left = (path for path in dict.fromkeys(paths) if path.is_file() and cache not in path.parents)
     found.extend(f"the file {path} is written" for path in left)
 
@@ -145,8 +145,8 @@ def forgetting(cls: type[Method]) -> Iterator[Callable[[], None]]:
     """Yield a function that resets what a method keeps outside of its objects, as a new process would.
 
     It resets the attributes of the class, and the global variables of the class's package that its functions
-    use, to copies of their values at the start. What cannot be copied is left. At the end each variable holds
-    the object that it held at the start.
+    use, to copies of their values at the start. Values that cannot be copied stay as they are. At the end
+    each variable holds the object that it held at the start.
     """
     places: list[tuple[Any, set[str] | None]] = [(one, None) for one in own_classes(cls)]
     places += [(sys.modules[module], names) for module, names in _used_globals(cls).items()]
@@ -168,7 +168,7 @@ def forgetting(cls: type[Method]) -> Iterator[Callable[[], None]]:
 
 
 def _used_globals(cls: type[Method]) -> dict[str, set[str]]:
-    """Return the names that a method's functions use, by module, also those of its package that they call."""
+    """Return the names that a method's functions use, by module, also via functions of its package."""
     found: dict[str, set[str]] = {}
     pending = [function for one in own_classes(cls) for function in functions_of(one).values()]
     packages = {package_of(one.__module__) for one in own_classes(cls)}
@@ -187,7 +187,7 @@ def _used_globals(cls: type[Method]) -> dict[str, set[str]]:
 
 
 def _variables(owner: Any, names: set[str] | None) -> dict[str, Any]:
-    """Return the variables of a class or a module that hold data: all, or those with one of some names."""
+    """Return the variables of a class or a module that hold data: all, or only those in `names`."""
     return {
         name: value
         for name, value in vars(owner).items()
@@ -204,7 +204,7 @@ def _copied(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values, as copies where they can change, without those that cannot be copied."""
     copies = {}
     for name, value in values.items():
-        # a copy of a plain `object()` would no longer be the mark that it is
+        # a copy of a plain `object()` would no longer serve as a sentinel
         changes = isinstance(value, _CONTAINERS) or bool(getattr(value, "__dict__", None))
         with contextlib.suppress(Exception):
             copies[name] = copy.deepcopy(value) if changes else value
@@ -220,7 +220,7 @@ _hooked = False
 
 @contextmanager
 def _written() -> Iterator[list[Path]]:
-    """Record the files that Python opens for writing inside; files of compiled libraries are missed."""
+    """Record the files that Python opens for writing in the block; files of compiled libraries are missed."""
     global _recording, _hooked
     if not _hooked:  # an audit hook stays until the process ends
         sys.addaudithook(_audit)

@@ -51,8 +51,8 @@ PAGE = "docs/guide/your_policy.md"
 def check_policy(kind: str, image_size: int = 0) -> None:
     """Check on the toy's data that a policy keeps the protocol of `clbench.Policy`.
 
-    The policy is built with the toy's sizes and normalised like its demonstrations: a class that loads
-    pretrained weights must go without them here.
+    The policy is built with the toy's sizes and normalised like the toy's demonstrations: a class that loads
+    pretrained weights must do without them here.
 
     Args:
         kind: Kind of the policy: a built-in name, or "module:Class".
@@ -96,7 +96,7 @@ def _named(clause: Callable[[Subject], None]) -> Callable[[Subject], None]:
 
 
 class Subject:
-    """A policy, and samples to look at it with.
+    """A policy, and samples to check it on.
 
     Args:
         kind: Kind of the policy.
@@ -266,7 +266,7 @@ def learning(subject: Subject) -> None:
 
 
 def checkpoints(subject: Subject) -> None:
-    """Weights and normalisation are all that a checkpoint must hold, after some training, too."""
+    """Weights and normalisation are all that a checkpoint must hold, also after some training."""
     policy, batch = subject.build(3), subject.batch
     policy.train()
     optimise(policy.parameters(), 2e-3, 4, lambda _: policy.action_loss(batch).mean())
@@ -336,7 +336,7 @@ def _breach(clause: Callable[[Subject], None], expected: str, found: str, look: 
 
 
 def _stripes(state: Tensor, size: int) -> Tensor:
-    """Return pictures (B, N, N, 3) with a stripe for each number of the states (B, S), as bright as it."""
+    """Return pictures (B, N, N, 3): each number of the states (B, S) sets the brightness of a stripe."""
     stripe = torch.arange(size) * state.shape[1] // size
     grey = (255 * torch.sigmoid(state)).to(torch.uint8)[:, stripe]
     return grey[:, None, :, None].repeat(1, size, 1, 3)

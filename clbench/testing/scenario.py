@@ -59,7 +59,7 @@ def check_scenario(scenario: Scenario | str, *, episodes: int = 10, success: flo
         success: Share of the episodes in which the expert must succeed.
 
     Raises:
-        InputError: The number of episodes is no whole number from 1.
+        InputError: The number of episodes is not a whole number of at least 1.
         UnknownNameError: An entry point does not exist.
         ScenarioError: Any other part is wrong, or its code raises an error, which is then the cause.
     """
@@ -109,7 +109,7 @@ def _running(part: str) -> Iterator[None]:
     """Turn an error that the code of a part raises into one that names the part.
 
     Raises:
-        ScenarioError: Something else than a clause of the check failed; the error is its cause.
+        ScenarioError: Something other than a clause of the check failed; the error is its cause.
     """
     try:
         yield
@@ -169,7 +169,7 @@ def _check_task(task: Task, world: World, episodes: int, success: float) -> None
 
 
 def _aimless(world: World) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
-    """Return an expert without an aim, for tasks that have none: a state gives the same random action."""
+    """Return an aimless expert, for tasks without one: a state always gives the same random action."""
 
     def act(state: NDArray[np.float32]) -> NDArray[np.float32]:
         generator = np.random.default_rng(np.frombuffer(state.tobytes(), np.uint8))

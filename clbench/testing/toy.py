@@ -91,7 +91,7 @@ def toy_expert(task: str) -> Callable[[State], Action]:
 
 
 def _sign(column: int) -> Callable[[State], NDArray[np.int64]]:
-    """Return the rule for the side of the marker on which the point is, along a column of the state."""
+    """Return a function that tells on which side of the marker the point is, along a column of the state."""
 
     def answer(state: State) -> NDArray[np.int64]:
         difference = state[:, column] - state[:, column + 2]

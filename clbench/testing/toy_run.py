@@ -63,7 +63,7 @@ def toy_data(policy: str) -> tuple[TrainingData, Policy]:
 
 @functools.cache
 def frozen_return(policy: str) -> float:
-    """Return the mean return of a pretrained policy, as `mean_return`."""
+    """Return the mean return of a pretrained policy, as defined by `mean_return`."""
     _, pretrained = toy_data(policy)
     return mean_return(pretrained)
 
@@ -142,7 +142,7 @@ class ToyRun:
                         self.trainer.load(folder, number)
 
     def _is_learned(self, number: int, step: Step) -> bool:
-        """Return whether a stage ends after a step; each check asks for the policy that it would leave."""
+        """Return whether a stage ends after a step; checks ask for the policy that it would leave."""
         if step.done not in self.trainer.scenario.budget.check_steps:
             return False
         try:

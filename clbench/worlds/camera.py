@@ -1,9 +1,9 @@
 """Cameras: the picture and the numbers that a policy sees of a world whose state it must not know.
 
 The states of a task with a camera hold everything: experts act on them, questions are answered from them,
-and pictures are drawn from them alone. A policy sees a part of the numbers, and the picture. Demonstrations
-therefore stay small data sets of states. A picture is drawn when it is needed: when a policy replans, and
-once for each state of the demonstrations and the questions (`clbench.worlds.observation`).
+and pictures are drawn from them alone. A policy sees some of the numbers, and the picture. Demonstrations
+therefore stay small datasets of states. A picture is drawn when it is needed: when a policy replans, and once
+for each state of the demonstrations and the questions (`clbench.worlds.observation`).
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ VIEW_SIZE = 4
 
 
 class Camera(Protocol):
-    """Draws the states of a world. It is made without arguments, in a process that may draw."""
+    """Draws the states of a world. The constructor has no arguments, and runs in a process that may draw."""
 
     image_size: ClassVar[int]
     """Width and height of a picture, in pixels."""
     state_size: ClassVar[int]
-    """Count of the numbers of a state that a policy sees."""
+    """Number of values of a state that a policy sees."""
 
     @staticmethod
     def proprioception(states: States) -> States:
@@ -40,7 +40,7 @@ class Camera(Protocol):
 
     @staticmethod
     def pictured(states: States) -> States:
-        """Return numbers (N, K) that pictures of the states (N, S) show, which vision learns to predict.
+        """Return numbers (N, K) that pictures of the states (N, S) show; vision learns to predict them.
 
         No policy sees these numbers.
         """
@@ -62,7 +62,7 @@ def load_camera(entry_point: str) -> type[Camera]:
     """Return the camera at "module:attribute".
 
     Raises:
-        UnknownNameError: The entry point leads to nothing.
+        UnknownNameError: There is nothing at the entry point.
         WrongTypeError: The object lacks a member of a camera.
     """
     camera: type[Camera] = resolve(entry_point)

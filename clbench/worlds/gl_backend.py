@@ -38,7 +38,7 @@ class RenderingError(ClbenchError):
 def rendering_fault(back_end: str, world: str | None = None) -> str | None:
     """Return the reason why a back end cannot draw, None if it can.
 
-    The trial has its own process, which a failure may kill.
+    The trial runs in a process of its own, which a failure may kill.
 
     Args:
         back_end: Value for the variable `MUJOCO_GL`.
@@ -59,7 +59,7 @@ def rendering_fault(back_end: str, world: str | None = None) -> str | None:
 
 
 def environment_of(back_end: str) -> dict[str, str]:
-    """Return the environment of a process that draws with a back end and imports from the same places."""
+    """Return the environment variables of a process that uses a back end and the same import paths."""
     path = os.pathsep.join(entry for entry in sys.path if entry)
     return {**os.environ, "MUJOCO_GL": back_end, "PYTHONPATH": path}
 
@@ -68,8 +68,8 @@ def environment_of(back_end: str) -> dict[str, str]:
 def draw_without_display() -> None:
     """Let MuJoCo draw in this process if there is neither a display nor a choice of `MUJOCO_GL`.
 
-    Sets `MUJOCO_GL` to the first back end that can draw, which worlds look at when they draw first. If none
-    can, nothing is set, and the world's own error stands.
+    Sets `MUJOCO_GL` to the first back end that can draw. Worlds read the variable when they first draw. If no
+    back end can draw, nothing is set, and the world raises its own error.
     """
     if sys.platform != "linux" or any(
         os.environ.get(name) for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")
@@ -79,7 +79,7 @@ def draw_without_display() -> None:
         if rendering_fault(back_end) is None:
             os.environ["MUJOCO_GL"] = back_end
             bound = sys.modules.get("mujoco.rendering.classic.gl_context")
-            if bound is not None:  # MuJoCo's own renderer takes the back end of the time of its import
+            if bound is not None:  # MuJoCo's own renderer keeps the back end that its import found
                 importlib.reload(bound)
             return
 

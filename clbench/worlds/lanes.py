@@ -49,7 +49,7 @@ class PlainVectorWorld:
         return np.stack(states)
 
     def step(self, lanes: Sequence[int], actions: NDArray[np.float32]) -> Outcomes:
-        """Move each of `lanes`, none twice, by its row of actions (N, A)."""
+        """Step each of `lanes`, none of them twice, with its row of the actions (N, A)."""
         outcomes = []
         actions = checked_actions(actions, self.single_action_space, "plain", len(lanes))
         for lane, action in zip(lanes, actions, strict=True):
@@ -72,9 +72,9 @@ def vector_world(entry_point: str, lanes: int, threads: int = 1, perturbed: bool
 
     Args:
         entry_point: Entry point of the world.
-        lanes: Places for episodes.
+        lanes: Number of lanes.
         threads: Threads that a suite's own vector world may use.
-        perturbed: Whether its episodes are perturbed; `check_perturbable` refuses worlds that cannot be.
+        perturbed: Whether its episodes are perturbed; `check_perturbable` refuses worlds without support.
     """
     world = resolve(entry_point)
     options = {"perturbed": True} if perturbed else {}
@@ -120,7 +120,7 @@ def check_perturbable(tasks: Iterable[Task]) -> None:
 
 
 class Lanes:
-    """Places for episodes of any tasks: each runs in the vector world of its task.
+    """Slots for episodes of any tasks; each episode runs in the vector world of its task.
 
     Args:
         count: Number of lanes; they are numbered from 0.
@@ -197,7 +197,7 @@ class Lanes:
         return states
 
     def step(self, lanes: Sequence[int], actions: NDArray[np.float32]) -> Outcomes:
-        """Move each of `lanes`, none twice, by its row of actions (N, A)."""
+        """Step each of `lanes`, none of them twice, with its row of the actions (N, A)."""
         states, rewards, successes = (
             self._empty(lanes),
             np.empty(len(lanes)),

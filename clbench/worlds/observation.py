@@ -102,7 +102,7 @@ class Observer:
         share = TOGETHER * len(self._processes)
         for start in range(0, len(rows), share):
             some = rows[start : start + share]
-            busy = self._processes[: len(some)]  # none draws nothing
+            busy = self._processes[: len(some)]  # no process gets an empty part
             try:
                 for process, part in zip(busy, np.array_split(some, len(busy)), strict=True):
                     process.ask(part)
@@ -136,7 +136,7 @@ class _DrawingProcess:
         )
 
     def ask(self, rows: States) -> None:
-        """Send views and states (N, 4 + S); this waits until the earlier ones are drawn."""
+        """Send views and states (N, 4 + S), after waiting until the earlier ones are drawn."""
         assert self._process.stdin is not None
         self._asked = len(rows)
         try:
@@ -155,7 +155,7 @@ class _DrawingProcess:
         return np.frombuffer(answer, np.uint8).reshape(shape)
 
     def _end(self) -> RenderingError:
-        """Return the error for a process that ended too early, with the last line of its output."""
+        """Return the error for a process that ended too early, with the last line of its error output."""
         code = self._process.wait()
         self._complaints.seek(0)
         lines = self._complaints.read().decode(errors="replace").strip().splitlines()
@@ -185,7 +185,7 @@ def _back_end(world: str, chosen: str) -> str:
 
 
 def observed(task: Task, states: States) -> tuple[States, Images]:
-    """Return the observations of a data set's states (N, S): numbers (N, P) and pictures.
+    """Return the observations of a dataset's states (N, S): numbers (N, P) and pictures.
 
     All cores draw the pictures on first use; the cache keeps them.
 

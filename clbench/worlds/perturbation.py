@@ -1,10 +1,10 @@
 """Perturbations: the changes to the world in a perturbed episode.
 
-A perturbed episode has the seed, the instruction and the policy's draws of the test episode of its number.
-Only the start (its pose, or on dm_control its speeds), the masses of objects and, where a policy sees
-pictures, camera and light differ. They follow from that seed alone, in their own random stream: all other
-draws of the episode stay the same. Each suite gives the scale of a displaced start, and each camera the scale
-of its view, with reasons.
+A perturbed episode has the seed, the instruction and the policy's draws of the test episode with the same
+number. Only the start (its pose, or on dm_control its speeds), the masses of objects and, where a policy sees
+pictures, camera and light differ. These changes depend on the seed alone, and have their own random stream:
+all other draws of the episode stay the same. Each suite gives the scale of a displaced start, and each camera
+the scale of its view, with reasons.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     import mujoco
 
 MASSES = (0.5, 2.0)
-"""Factors on the mass and the moments of inertia of an object. Policies have met the plain mass alone, and
-experts of skills succeed with both factors. Two values rather than a range: no episode is nearly plain, and
-all episodes of one mass share a compiled model, of 9 MB in Fetch and 18 MB in Meta-World."""
+"""Factors on the mass and the moments of inertia of an object. Policies have met only the plain mass, and
+experts of skills succeed with both factors. There are two values rather than a range: no episode is nearly
+plain, and all episodes of one mass share a compiled model, of 9 MB in Fetch and 18 MB in Meta-World."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ HEADER = struct.Struct("<II")
 
 
 def main(entry_point: str) -> None:
-    """Draw the rows from standard input, bare numbers after a header, until the input ends.
+    """Draw the rows of numbers that follow each header on standard input, until the input ends.
 
     Args:
         entry_point: Entry point of the camera.

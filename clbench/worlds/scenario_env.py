@@ -37,13 +37,13 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     with `instruction="tokens"` the word ids, int64 (L,), for agents that need numbers. Where the task has a
     camera, `state` holds only the numbers that a policy may see, and `image`, uint8 (N, N, 3), the picture.
     Action: float32 (A,), from -1 to 1, clipped; a number that is not finite is refused.
-    Reward: that of the task's world: dense, but sparse on LIBERO. An episode is terminated by success and
-    truncated at the task's horizon. Where success is judged only there, as on dm_control, an episode is
-    always truncated, and `info` alone tells success.
+    Reward: the reward of the task's world, which is dense, but sparse on LIBERO. An episode is terminated by
+    success and truncated at the task's horizon. Where success is judged only at the horizon, as on
+    dm_control, an episode is always truncated, and `info` alone reports success.
     Info: `task`, `stage`, `instruction`, `success`. The stage is 0 for all tasks that no stage trains;
-    `scenario.group(info["task"])` tells which part of the scenario a task belongs to. The wordings are those
-    of training: `clbench.evaluate_agent` and `clbench score` also play episodes with test wordings. A copy
-    made by pickle is a new environment, which begins with its own first `reset()`.
+    `scenario.group(info["task"])` tells which part of the scenario a task belongs to. Instructions have the
+    training wordings; `clbench.evaluate_agent` and `clbench score` also play episodes with test wordings. A
+    copy made by pickle is a new environment, which begins with its own first `reset()`.
     Metadata: `render_fps` is the rate of the present task, in steps per second. Gymnasium's `RecordVideo`
     reads it once: where a world has several rates, wrap the environment after `reset()`.
 
@@ -53,7 +53,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         episodes_per_stage: Episodes after which `reset()` goes on to the next stage.
         stage: Stage to stay in, for an agent that is trained stage by stage; None goes through all stages.
         order: Order of the targets, see `Scenario.in_order`; 0 is the published order.
-        task: Name of the only task, for example to evaluate one skill; None has those of the stages.
+        task: Name of the only task, for example to evaluate one skill; None plays the tasks of the stages.
         render_mode: "rgb_array" or None, passed on to the worlds.
 
     Raises:
@@ -118,7 +118,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
         Raises:
             UnknownNameError: The scenario has no such task.
-            InputError: It has no such stage, or an option is unknown.
+            InputError: The scenario has no such stage, or an option is unknown.
         """
         super().reset(seed=seed)
         self.begun_at = self.begun_at or time.perf_counter()

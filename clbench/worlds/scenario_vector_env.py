@@ -31,11 +31,11 @@ Outcome = tuple[Observation, NDArray[np.float64], Flags, Flags, dict[str, Any]]
 class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     """Many `ScenarioEnv`, each with its own schedule, stepped together by the suite's vector world.
 
-    What `reset` and `step` return, the spaces, `np_random` and `np_random_seed` equal those of a
-    `gymnasium.vector.SyncVectorEnv` of them bit for bit, in all modes of autoreset. Errors have other types
-    and texts. There are no single environments: `envs`, `call`, `get_attr`, `set_attr` and `render` are
-    missing, and `gymnasium.make_vec(..., vectorization_mode="sync")` has them. A copy made by pickle is a new
-    vector, which begins with its own first `reset()`.
+    The results of `reset` and `step`, the spaces, `np_random` and `np_random_seed` equal those of a
+    `gymnasium.vector.SyncVectorEnv` of these environments bit for bit, in all autoreset modes. Errors have
+    other types and texts. There are no single environments: `envs`, `call`, `get_attr`, `set_attr` and
+    `render` are missing; `gymnasium.make_vec(..., vectorization_mode="sync")` has them. A copy made by pickle
+    is a new vector environment, which begins with its own first `reset()`.
 
     Args:
         scenario: Scenario, or its entry point "module:attribute".
@@ -44,15 +44,15 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         episodes_per_stage: Episodes after which an environment goes on to the next stage.
         stage: Stage to stay in, for an agent that is trained stage by stage; None goes through all stages.
         order: Order of the targets, see `Scenario.in_order`; 0 is the published order.
-        task: Name of the only task, or one for each environment, for example to learn all at once; None has
-            those of the stages.
+        task: Name of the only task, or one for each environment, for example to learn all at once; None plays
+            the tasks of the stages.
         threads: Threads that step the worlds, by default one per core, at most one per environment.
-            Results do not depend on it.
+            Results do not depend on their number.
         render_mode: None; environments side by side cannot be drawn.
         autoreset_mode: When an environment whose episode has ended begins the next one. `NEXT_STEP` begins it
-            at the next step, which ignores its action. `SAME_STEP` begins it at once; the infos then hold
-            what the episode ended with, as `final_obs` and `final_info`. `DISABLED` leaves it to `reset` with
-            the option "reset_mask".
+            at the next step, which ignores its action. `SAME_STEP` begins it at once; the infos then hold the
+            last observation and info of the old episode, as `final_obs` and `final_info`. `DISABLED` leaves
+            it to `reset` with the option "reset_mask".
 
     Raises:
         MissingPackageError: A package that the tasks need is not installed; the message says how to get it.
@@ -134,7 +134,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
 
     @property
     def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
-        """The seeds of these generators."""
+        """The seeds of the generators in `np_random`."""
         return tuple(seed for _, seed in self._generators)
 
     def reset(
@@ -148,10 +148,10 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
                 "reset_mask", an array (N,) of bool, the other environments go on with their episodes.
 
         Raises:
-            ResetNeeded: A first `reset` has a mask.
+            ResetNeeded: The first `reset` has a mask.
             UnknownNameError: The scenario has no such task.
-            InputError: It has no such stage, an option is unknown, or the number of seeds is wrong.
-            WrongTypeError: A seed is no whole number.
+            InputError: The scenario has no such stage, an option is unknown, or the number of seeds is wrong.
+            WrongTypeError: A seed is not a whole number.
         """
         self.begun_at = self.begun_at or time.perf_counter()
         options = dict(options or {})
@@ -168,7 +168,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         return self._observation(self._everywhere), info
 
     def _chosen(self, mask: Any) -> list[int]:
-        """Return the environments that begin an episode: all, or those of a mask."""
+        """Return the environments that begin an episode: all, or those that a mask selects."""
         if mask is None:
             return self._everywhere
         is_mask = isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.shape == (self.num_envs,)
@@ -194,7 +194,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         return [None if one is None else int(one) for one in seeds]
 
     def step(self, actions: NDArray[np.float32]) -> Outcome:
-        """Take one step in every environment; `autoreset_mode` tells where the next episode begins.
+        """Take one step in every environment; `autoreset_mode` decides when the next episode begins.
 
         Raises:
             ResetNeeded: There was no `reset` yet, or without autoreset, an episode has ended.
@@ -227,7 +227,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         return self._observation(self._everywhere), rewards, terminated, truncated, info
 
     def _finished(self, numbers: list[int], successes: Flags) -> dict[str, Any]:
-        """Begin the next episodes of the environments `numbers`, and return what the last ones ended with."""
+        """Begin the next episodes of the environments `numbers`; return the final infos of the ended ones."""
         shown = self._observation(numbers)
         info: dict[str, Any] = {}
         for row, number in enumerate(numbers):
@@ -277,7 +277,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         }
 
     def _observation(self, numbers: list[int]) -> Observation:
-        """Return the observations of the environments `numbers`, which later steps leave as they are."""
+        """Return the observations of the environments `numbers`; later steps do not change them."""
         tasks = [self._tasks[number] for number in numbers]
         state, image = self._lanes.observe(numbers, tasks, self._states[numbers])
         images = {"image": image} if image.size else {}
@@ -307,7 +307,7 @@ def _one_each(task: str | Sequence[str] | None, count: int) -> Sequence[str | No
 
 
 def _mode(chosen: str | AutoresetMode) -> AutoresetMode:
-    """Return a mode of autoreset by its name, such as "SameStep"."""
+    """Return the autoreset mode with a name such as "SameStep"."""
     try:
         return AutoresetMode(chosen)
     except ValueError as error:

@@ -116,7 +116,7 @@ class Schedule:
 
         Raises:
             UnknownNameError: The scenario has no such task.
-            InputError: It has no such stage, or an option is unknown.
+            InputError: The scenario has no such stage, or an option is unknown.
         """
         if set(options) - {"task", "stage"}:
             raise InputError(f'Options of reset are "task" and "stage", not {sorted(options)}.')
@@ -128,7 +128,7 @@ class Schedule:
         return Start(task, stage, words, shown, int(generator.integers(2**31)))
 
     def _choose(self, options: Mapping[str, Any]) -> tuple[Task, int]:
-        """Return task and stage of the next episode."""
+        """Return the task and the stage of the next episode."""
         scenario = self._scenario
         if "stage" in options:
             self._check_stage(options["stage"])

@@ -1,4 +1,4 @@
-"""Threads that share the stepping of worlds, and what each of them needs for itself."""
+"""Threads that step worlds together, and the objects that each of them needs for itself."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ team at any moment, even while its thread holds a lock that an ending thread nee
 PROCESS_CGROUPS = Path("/proc/self/cgroup")
 """File in which Linux lists the control groups of this process, a line for each hierarchy."""
 CGROUPS = Path("/sys/fs/cgroup")
-"""Folder of the control groups: those of version 2, and a folder for each controller of version 1."""
+"""Folder of the control groups of version 2; for version 1 it has a folder for each controller."""
 
 
 def cores() -> int:
     """Return the number of cores that this process may use, which may be only some of the machine's.
 
-    The cores that it may run on count, and the CPU quota of its control groups, rounded up: a container with
-    4.5 of 128 cores has 5.
+    The cores that the process may run on limit the number, and so does the CPU quota of its control groups,
+    rounded up: a container with 4.5 of 128 cores has 5.
     """
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     quota = _quota()
@@ -39,7 +39,7 @@ def _quota() -> float:
     """Return the smallest CPU quota of this process's control groups and their parents, in cores."""
     try:
         lines = PROCESS_CGROUPS.read_text(encoding="utf-8").splitlines()
-    except OSError:  # this is no Linux
+    except OSError:  # this is not Linux
         return math.inf
     quotas = [math.inf]
     for line in lines:
@@ -65,9 +65,9 @@ def _quota_of(*files: Path) -> float:
 
 
 class Team:
-    """Threads that share work, the calling thread among them; MuJoCo releases the interpreter lock.
+    """Threads, including the calling one, that share work in parallel: MuJoCo releases the interpreter lock.
 
-    A team that nobody closes ends with its last reference, or when the interpreter exits.
+    A team that nobody closes ends with the last reference to it, or when the interpreter exits.
 
     Args:
         threads: Number of threads.
@@ -83,7 +83,7 @@ class Team:
     def each(self, work: Callable[[Item], None], items: Sequence[Item]) -> None:
         """Do the work on each item, in any order: each thread takes the next item that is left.
 
-        If the calling thread is interrupted, the others end the items that they have begun, and take no more.
+        If the calling thread is interrupted, the others finish the items that they have begun, then stop.
         """
         left, interrupted = iter(items), False
 
@@ -142,25 +142,25 @@ class _Helper:
 
 
 class Copies(Generic[Item]):
-    """Something that one thread at a time may change, such as a compiled scene, and copies for the others.
+    """An object that one thread at a time may change, such as a compiled scene, and copies for other threads.
 
     Args:
-        first: What the first thread gets.
-        copied: Returns a copy, made only when a further thread needs one.
+        first: Object for the first thread.
+        copied: Returns a copy; called only when a further thread needs one.
     """
 
     def __init__(self, first: Item, copied: Callable[[], Item]) -> None:
         self._copied, self._free = copied, [first]
 
     def take(self) -> Item:
-        """Return one that no other thread uses."""
+        """Return an object that no other thread uses."""
         try:
             return self._free.pop()
         except IndexError:
             return self._copied()
 
     def give_back(self, taken: Item) -> None:
-        """Make it available to other threads."""
+        """Make an object available to other threads again."""
         self._free.append(taken)
 
 
@@ -183,11 +183,11 @@ def _error_of(work: Callable[[], None]) -> Exception | None:
 
 
 def _end(helpers: list[_Helper], patience: float | None) -> None:
-    """End the threads of helpers and wait for them, except for the calling thread.
+    """End the threads of helpers, and wait for all of them but the calling thread.
 
     Args:
         helpers: Helpers to end; the list is empty afterwards.
-        patience: Longest wait for a thread in seconds; None waits as long as it takes.
+        patience: Longest wait for a thread in seconds; None sets no limit.
     """
     for helper in helpers:
         helper.asked.put(None)

@@ -35,18 +35,19 @@ Outcomes: TypeAlias = tuple[States, NDArray[np.float64], NDArray[np.bool_]]
 class VectorWorld(Protocol):
     """Many episodes of one world side by side, each in a lane.
 
-    A suite has its own where many episodes step faster together than one after the other: the attribute
-    `vector_world` of its world makes it from the number of lanes and the number of threads. Each episode
-    equals the plain world's bit for bit, whatever the other lanes do. The caller resets a lane before it
-    steps it, counts the steps, and leaves a lane alone once its episode has succeeded.
+    A suite has its own vector world where many episodes step faster together than one after the other. The
+    attribute `vector_world` of its world makes it from the number of lanes and the number of threads. Each
+    episode equals an episode of the plain world bit for bit, whatever the other lanes do. The caller resets a
+    lane before stepping it, counts the steps, and leaves a lane alone once its episode has succeeded.
 
-    The class that makes the episodes, this one or a plain world without vector world, declares
+    The class that makes the episodes, this one or a plain world without a vector world, declares
     `perturbable: ClassVar[bool] = True` if it also takes the keyword argument `perturbed`. Its episodes are
-    then perturbed by `clbench.worlds.perturbation.draw_perturbation`. Without the declaration it cannot be.
+    then perturbed by `clbench.worlds.perturbation.draw_perturbation`. Without the declaration its episodes
+    cannot be perturbed.
 
     A plain world that judges success only at the horizon of its tasks declares
-    `success_at_horizon: ClassVar[bool] = True`, whether it has a vector world or not. A success is then no
-    end of the task: environments report it in `info` and call the episode truncated, not terminated.
+    `success_at_horizon: ClassVar[bool] = True`, whether it has a vector world or not. A success then does not
+    end the task: environments report it in `info` and call the episode truncated, not terminated.
     """
 
     single_observation_space: spaces.Box
@@ -59,11 +60,11 @@ class VectorWorld(Protocol):
         ...
 
     def step(self, lanes: Sequence[int], actions: NDArray[np.float32]) -> Outcomes:
-        """Move each of `lanes`, none twice, by its row of actions (N, A)."""
+        """Step each of `lanes`, none of them twice, with its row of the actions (N, A)."""
         ...
 
     def close(self) -> None:
-        """Free the worlds and threads that it holds."""
+        """Free all worlds and threads."""
         ...
 
 
@@ -89,7 +90,7 @@ def opened_worlds(**options: Any) -> Iterator[Callable[[Task], World]]:
 
 
 class OneLaneWorld(World, ABC):
-    """A plain world that is the suite's own vector world with one lane: one physics serves both.
+    """A plain world that is the suite's own vector world with one lane: both share one physics.
 
     A suite names its vector world and its first task, draws the picture in `picture`, and gives the number of
     steps per second in its metadata. The vector world declares whether it is `perturbable`.
@@ -128,7 +129,7 @@ class OneLaneWorld(World, ABC):
         return state, {"success": False, "task": task}
 
     def step(self, action: NDArray[np.float32]) -> tuple[States, float, bool, bool, dict[str, Any]]:
-        """Move for one step.
+        """Take one step.
 
         Raises:
             InputError: The action has another shape than the action space, or a number in it is not finite.
@@ -194,7 +195,7 @@ def checked_actions(
 
     Raises:
         InputError: An action has another shape than the space, a number in it is not finite, or there is not
-            one for each of the N lanes.
+            one action for each of the `lanes`.
     """
     actions = np.asarray(actions)
     if actions.shape[1:] != space.shape:

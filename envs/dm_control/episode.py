@@ -82,5 +82,5 @@ class Episode:
         return float(self.rule.reward(observation, self.control))
 
     def training_reward(self, observation: Observation) -> float:
-        """Return the reward of that step in the training of experts."""
+        """Return the reward of the step that led to `observation` (K,), as experts are trained on it."""
         return float(self.rule.training_reward(observation, self.control))

@@ -29,12 +29,12 @@ Layer = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 class ExpertError(ClbenchError):
-    """The files of an expert are unusable; the message gives the reason and the way to get others."""
+    """The files of an expert are unusable; the message gives the reason, and says how to get new ones."""
 
 
 @dataclass(frozen=True)
 class Expert:
-    """A policy without memory: the mean action of an actor of SAC, squashed by tanh."""
+    """A policy without memory: the mean action of a SAC actor, squashed by tanh."""
 
     layers: tuple[Layer, ...]
     """Layers from the observation to the action, with rectifiers between them."""
@@ -71,7 +71,7 @@ def expert(task: str) -> Expert:
 
     Raises:
         UnknownNameError: No task has this name; the error names the nearest one.
-        ExpertError: The expert's files are missing, damaged or of another task.
+        ExpertError: The expert's files are missing or damaged, or belong to another task.
     """
     if task not in RULES:
         raise unknown("expert of the dm_control world", task, RULES)
@@ -82,7 +82,7 @@ def expert_return(task: str) -> float:
     """Return the mean return of the expert's episodes, which defines success.
 
     Raises:
-        ExpertError: The expert's files are missing, damaged or of another task.
+        ExpertError: The expert's files are missing or damaged, or belong to another task.
     """
     return _shipped(task)[1]
 
@@ -96,7 +96,7 @@ def read_expert(folder: Path, task: str) -> tuple[Expert, float]:
     """Return the task's expert in `folder` and the mean return of its episodes.
 
     Raises:
-        ExpertError: The expert's files are missing, damaged or of another task.
+        ExpertError: The expert's files are missing or damaged, or belong to another task.
     """
     weights, card = folder / f"{task}.safetensors", folder / f"{task}.json"
     way_out = f"`clbench experts train {task}` makes it; if it came with clbench, reinstall clbench."

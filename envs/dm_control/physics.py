@@ -44,7 +44,7 @@ class DMControlVectorWorld:
     Args:
         lanes: Number of lanes. A lane allocates its memory when it first has a body.
         threads: Number of threads that advance the physics; MuJoCo releases the interpreter lock. Results do
-            not depend on it.
+            not depend on their number.
         perturbed: Whether the body, its pole or its ball is heavier or lighter, and starts in motion.
     """
 
@@ -79,7 +79,7 @@ class DMControlVectorWorld:
     def step(
         self, lanes: Sequence[int], actions: NDArray[np.float32]
     ) -> tuple[State, NDArray[np.float64], NDArray[np.bool_]]:
-        """Move each of `lanes` for one step by its row of actions (N, 2).
+        """Step each of `lanes` with its row of the actions (N, 2).
 
         Returns:
             The states (N, 19), the rewards (N,) in [0, 1], and which episodes succeeded (N,).

@@ -29,7 +29,7 @@ def _about(body: str, states: State, first: Truths, second: Truths) -> Answers:
 def _sign(
     body: str, value: Callable[[State], Values], margin: float = SIDE_MARGIN
 ) -> Callable[[State], Answers]:
-    """Return a rule that answers 0 where a value (N,) is below minus the margin, 1 where it is above it."""
+    """Return a rule that answers 0 where a value (N,) is below -`margin`, 1 where it is above `margin`."""
 
     def answer(states: State) -> Answers:
         values = value(states)

@@ -1,6 +1,6 @@
 """The tasks of the dm_control world: the body, the initial states and the rewards of each.
 
-A task named after one of dm_control's has dm_control's rewards. The others are variants on the same body with
+A task named after a task of dm_control has its rewards. The other tasks are variants on the same body with
 the same initial states; only the instruction distinguishes them.
 """
 
@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from .state import Observation
 
 HORIZON = 100
-"""Steps of an episode, of 0.04 s, or 0.16 s for the slow point mass. dm_control's last 10 s or 20 s."""
+"""Number of steps of an episode. A step takes 0.04 s, or 0.16 s for the slow point mass. dm_control's own
+episodes last 10 s or 20 s."""
 SUCCESS_SHARE = 0.8
 """Share of the expert's mean return that an episode must reach to succeed."""
 
@@ -40,8 +41,8 @@ class Rule:
     reward: Reward
     """Maps observations (N, K) after a step and the actions (N, A) that led there to rewards (N,), 0 to 1."""
     guide: Reward | None = None
-    """Maps the same arrays to the closeness (N,) of each state to a reward. Experts train on the mean of both
-    where the reward alone is nearly always 0; nothing else uses it."""
+    """Maps the same arrays to the closeness (N,) of each state to a reward. Where the reward alone is nearly
+    always 0, experts train on the mean of the reward and this guide; nothing else uses the guide."""
     mark: tuple[float, float] | None = None
     """Place of the drawn target (x, y) in metres, if the body has one."""
     batched: bool = False
@@ -49,7 +50,7 @@ class Rule:
     takes the C library's pow for one number, and a product for an array."""
 
     def rewards(self, observations: Observation, actions: NDArray[np.float64]) -> Rewards:
-        """Return the rewards (N,) of observations (N, K) after actions (N, A), with single calls' bits."""
+        """Return rewards (N,) for observations (N, K) after actions (N, A), with the bits of single calls."""
         if self.batched:
             return self.reward(observations, actions)
         pairs = zip(observations, actions, strict=True)
@@ -110,7 +111,7 @@ def _balance_at(observation: Observation, action: Rewards, *, place: float, marg
 
 
 def _catch(observation: Observation, _: Rewards) -> Rewards:
-    """Return whether the ball is in the cup, at rest 0.55 m high with the ball at 0.2 m."""
+    """Return 1 if the ball is in the cup, else 0; at rest the cup is 0.55 m high, and the ball 0.2 m."""
     x = abs(observation[..., 0] - observation[..., 2])
     z = abs(0.55 + observation[..., 1] - (0.2 + observation[..., 3]))
     inside: Rewards = (np.maximum(x, z) < CUP_HALF_SIZE - BALL_RADIUS).astype(np.float64)

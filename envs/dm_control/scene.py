@@ -56,7 +56,7 @@ class Start:
     task: Any
     """The `dm_control.suite.base.Task`."""
     model: mujoco.MjModel
-    """The scene of all episodes. `physics` has another: a reset switches its motors off for a moment."""
+    """The scene of all episodes. `physics` has one of its own: a reset briefly switches its motors off."""
 
     def begin(self, seed: int, data: mujoco.MjData) -> None:
         """Set `data` to the initial state that dm_control draws for a seed."""
@@ -104,7 +104,7 @@ def start(body: str, task: str) -> Start:
 
 @functools.cache
 def start_with_mass(body: str, task: str, mass: float) -> Start:
-    """Return the same with the body's `thing` `mass` times as heavy; all perturbed worlds share it."""
+    """Return the result of `start` with a body's `thing` `mass` times as heavy; perturbed worlds share it."""
     plain = start(body, task)
     thing = int(plain.model.body(plain.body.thing).id)
     return replace(plain, model=with_mass(plain.model, [thing], mass))

@@ -24,7 +24,7 @@ CLOSE, OPEN_UP = -1.0, 1.0
 PRESS_DEPTH = 0.035
 """Height in metres above the block's centre that a press aims at: the fingers touch at 0.0435."""
 CARRYING = 0.6
-"""Action of a held block's way, at which it does not slip."""
+"""Action that carries a held block, small enough that the block does not slip."""
 TRAVEL_HEIGHT = 0.11
 """Height in metres at which the closed gripper travels above a place, clear of the block, as at its start."""
 UP = np.array([0.0, 0.0, 1.0])
@@ -56,8 +56,8 @@ def _toward(state: State, place: Vector, fingers: float) -> Action:
 def _descend(state: State, place: Vector, clearance: float, fingers: float) -> Action:
     """Return the action that brings the gripper down on a place (3,) from `clearance` metres above.
 
-    The gripper follows a funnel: the further from the place in the plane, the higher. Below the funnel it
-    rises first, so that it passes over the block and not through it.
+    The gripper follows a funnel: the farther it is from the place in the plane, the higher it goes. Below the
+    funnel it rises first, so that it passes over the block and not through it.
     """
     error = place - state[GRIPPER]
     height = min(max(4.0 * (math.hypot(error[0], error[1]) - 0.012), 0.0), clearance)

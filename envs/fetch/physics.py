@@ -42,7 +42,7 @@ TARGET_HEIGHTS = (0.08, 0.30)
 APART = 0.10
 """Smallest distance in metres between block, gripper and target: no task is nearly done at the start."""
 NEARBY = 0.20
-"""Largest horizontal distance in metres from target to block: on longer ways the block slips away."""
+"""Largest horizontal distance in metres from target to block: over longer ones the block slips away."""
 
 START = 0.025
 """Largest displacement in metres of a perturbed gripper along each axis, 4.3 cm in all. As a target is at
@@ -51,7 +51,7 @@ SETTLE = 10
 """Steps until the displaced gripper is at rest, as many as FetchPickAndPlace-v4 takes for its own start."""
 
 BLOCK_CORNER, TARGET_CORNER = (1.12, 1.03), (1.48, 0.47)
-"""Corners of the table, in metres, where things lie that a task does not need: out of the gripper's way."""
+"""Corners of the table, in metres, for things that a task does not need, out of the gripper's way."""
 HELD = 0.0249
 """Position of each finger in metres around the block, which is 0.05 wide."""
 GRASP = 3
@@ -63,7 +63,7 @@ HAND_TURN = np.array([1.0, 0.0, 1.0, 0.0])
 """Added by gymnasium-robotics to the quaternion of the hand's goal, to keep the hand pointing down."""
 
 BLOCK_AXES, HAND, HAND_QUATERNION, MARKER = slice(6, 15), slice(15, 18), slice(18, 22), slice(22, 25)
-"""Their places in a lane's measurements, after the positions of the gripper (3,) and the block (3,)."""
+"""Places of these values in a lane's measurements, after the positions of gripper (3,) and block (3,)."""
 JOINTS = 25
 """First place of the joint positions in the measurements; the joint speeds follow."""
 
@@ -112,7 +112,7 @@ class FetchVectorWorld:
     Args:
         lanes: Number of lanes. A lane allocates its memory at its first reset.
         threads: Number of threads that advance the physics; MuJoCo releases the interpreter lock. Results do
-            not depend on it.
+            not depend on their number.
         perturbed: Whether the block is heavier or lighter, and the gripper starts elsewhere.
         rules: Definition of each task by name.
     """
@@ -137,8 +137,8 @@ class FetchVectorWorld:
     def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[str]) -> State:
         """Start an episode in each of `lanes` and return the states (N, 28).
 
-        The seed alone determines the place of the block; it is FetchPickAndPlace-v4's if that is within
-        reach.
+        The seed alone determines the place of the block, which is the same as in FetchPickAndPlace-v4 if that
+        place is within reach.
 
         Raises:
             UnknownNameError: No task has this name; the error names the nearest one.
@@ -169,7 +169,7 @@ class FetchVectorWorld:
     def step(
         self, lanes: Sequence[int], actions: NDArray[np.float32]
     ) -> tuple[State, NDArray[np.float64], NDArray[np.bool_]]:
-        """Move each of `lanes` for one step of 0.04 s by its row of actions (N, 4).
+        """Step each of `lanes` for 0.04 s with its row of the actions (N, 4).
 
         Returns:
             The states (N, 28), the rewards (N,), and which episodes succeeded (N,).
@@ -201,7 +201,7 @@ class FetchVectorWorld:
         return lane_at(self._lanes, number, "Fetch")
 
     def _lane_of(self, number: int, scene: Scene) -> _Lane:
-        """Return a lane with the physics of a scene, and make it anew if it had another scene."""
+        """Return a lane with the physics of a scene; make a new lane if the old one had another scene."""
         lane = self._lanes[number]
         if lane is None or lane.scene is not scene:
             self._lanes[number] = lane = _Lane(number, scene)
@@ -271,7 +271,7 @@ class FetchVectorWorld:
         self._measure(lane)
 
     def _measure(self, lane: _Lane) -> None:
-        """Copy the measurements of a lane, still in the caches of the thread that has advanced it."""
+        """Copy the measurements of a lane while they are in the caches of the thread that advanced it."""
         model, number = lane.scene.model, lane.number
         np.concatenate(lane.parts, out=self._measured[number])
         gripper, block, rotation = self._jacobians[number]

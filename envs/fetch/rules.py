@@ -1,7 +1,7 @@
-"""The tasks of the Fetch world: where things lie at the start, the condition of success, the way left to it.
+"""The tasks of the Fetch world: where things lie at the start, the success condition, and the distance to it.
 
-What a task does not need lies in a corner of the table. A policy can therefore see something of the task in
-the state, as in most real scenes.
+Things that a task does not need lie in a corner of the table. As in most real scenes, the state therefore
+tells a policy something about the task.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ CARRY_DISTANCE = 0.10
 """Metres by which a held block is carried toward the robot."""
 PUSH_DISTANCE = 0.10
 PUSH_CONE = 0.4
-"""Largest sideways error of a push per metre, 21.8 degrees, so that a diagonal push is not a straight one."""
+"""Largest sideways error of a push per metre, 21.8 degrees: a diagonal push must not count as straight."""
 NEAR = 0.05
-"""Largest distance in metres at which the gripper or the block is at the target, as in the tasks of Fetch."""
+"""Distance in metres below which the gripper or the block counts as at the target, as in Fetch's tasks."""
 CLOSED = 0.02
 """Opening of both fingers in metres below which the gripper is closed; an empty one closes to 0.00."""
 OPEN = 0.08
 """Opening of both fingers in metres above which the gripper is open; it opens to 0.10."""
 
 Numbers: TypeAlias = list[float]
-"""A state (28,) as plain numbers: NumPy takes three times as long for so few."""
+"""A state (28,) as plain numbers: for so few, NumPy takes three times as long."""
 Condition: TypeAlias = Callable[[Numbers, Numbers], bool]
 Distance: TypeAlias = Callable[[Numbers, Numbers], float]
 
@@ -64,7 +64,7 @@ class Rule:
     distance: Distance
     """Returns the distance in metres that the gripper and the block still have to move."""
     target_on_table: bool = False
-    """Whether the target is always on the table; otherwise it is in half of the episodes."""
+    """Whether the target is always on the table; otherwise it is there in half of the episodes."""
     layout: Layout = Layout()
     """Where things are at the start."""
 

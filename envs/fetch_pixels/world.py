@@ -31,7 +31,7 @@ Every target is on the table: one camera does not show the height of a target.
 THING_PLACES = np.array([[1.12, 0.52], [1.50, 0.96]])
 """Corners of the area of the table for things, x and y in metres."""
 THINGS_APART = 0.10
-"""Smallest distance in metres of a thing to the block, the target and the other thing."""
+"""Smallest distance in metres from a thing to the block, the target and the other thing."""
 
 PLAIN = np.zeros((1, VIEW_SIZE), np.float32)
 """The view of an unperturbed camera."""
@@ -72,7 +72,7 @@ class FetchPixelsVectorWorld(FetchVectorWorld):
     def step(
         self, lanes: Sequence[int], actions: NDArray[np.float32]
     ) -> tuple[State, NDArray[np.float64], NDArray[np.bool_]]:
-        """Move each of `lanes` for one step by its row of actions (N, 4), as `FetchVectorWorld` does."""
+        """Step each of `lanes` with its row of the actions (N, 4), as `FetchVectorWorld` does."""
         states, rewards, successes = super().step(lanes, actions)
         return self._complete(lanes, states), rewards, successes
 

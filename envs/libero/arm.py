@@ -29,7 +29,7 @@ Vector = NDArray[np.float64]
 SUBSTEPS = 25
 """Physics steps of 2 ms per action: 20 actions per second."""
 JOINTS = 7
-"""Joints of the arm, the first of every model; those of the two fingers follow."""
+"""Number of joints of the arm. They come first in every model; those of the two fingers follow."""
 REST = np.array([0.0, -1.61037389e-01, 0.0, -2.44459747, 0.0, 2.2267522, np.pi / 4])
 """Joint positions at which LIBERO's robots begin, and to which the redundant joint is drawn (7,)."""
 SCALE = np.array([0.05, 0.05, 0.05, 0.5, 0.5, 0.5])
@@ -86,16 +86,16 @@ class Sensed(NamedTuple):
 
 
 class Aim(NamedTuple):
-    """What the controller heads for in an action."""
+    """The goals of the controller in an action."""
 
     place: Vector
     """Goal of the hand's position (3,)."""
     axes: Vector
-    """Goal of its orientation (3, 3)."""
+    """Goal of the hand's orientation (3, 3)."""
     closing: Vector
-    """Shares to which the fingers are closed (2,), which change."""
+    """Shares to which the fingers are closed (2,), which each physics step changes."""
     direction: float
-    """1 to close them, -1 to open them, 0 to leave them."""
+    """1 to close the fingers, -1 to open them, 0 to leave them."""
 
 
 class Motors(NamedTuple):
@@ -113,7 +113,7 @@ class Motors(NamedTuple):
 def _drive(sensed: Sensed, aim: Aim, motors: Motors) -> None:
     """Set the controls of a physics step: torques of the joints, and places of the fingers.
 
-    Matrices have the layouts in memory that robosuite's have, column by column: others change the last bit.
+    Matrices have the memory layout of robosuite's, column by column: another layout changes the last bit.
     """
     jacobian, speeds = sensed.jacobian, sensed.speeds
     of_both = jacobian[:, :JOINTS].T.copy().T
@@ -145,7 +145,7 @@ def _finish(model: int, data: int, site: int, sensed: Sensed, aim: Aim, motors: 
         data: Address of the episode's physics.
         site: Number of the point that the controller moves.
         sensed: The episode's own views and buffers, which change with the physics.
-        aim: What the action heads for.
+        aim: Goals of the action.
         motors: The episode's motors.
     """
     _step2(model, data)

@@ -27,7 +27,7 @@ HAND_BODY, HAND_SITE = "robot0_right_hand", "gripper0_grip_site"
 
 
 class Episode:
-    """An episode of any task in one scene, one after the other.
+    """Runs episodes of any tasks in one scene, one after the other.
 
     Args:
         problem: Problem of the first task; `begin` takes others in the same scene.
@@ -64,7 +64,7 @@ class Episode:
         return self.state()
 
     def _set(self, start: NDArray[np.float64]) -> None:
-        """Set time, positions and velocities (1 + nq + nv,), and forget all before."""
+        """Set time, positions and velocities (1 + nq + nv,), and forget everything before."""
         model, data = self.problem.scene.model, self.data
         mujoco.mj_resetData(model, data)  # also clears controls and the warm start of the solver
         data.time = start[0]
@@ -73,7 +73,7 @@ class Episode:
     def _fall(self, start: NDArray[np.float64]) -> None:
         """Let things come to rest with their own mass, while the robot stands still as in `start`.
 
-        The bowl that LIBERO drops onto the ramekin stays on its rim, but bounces off if it is twice as heavy.
+        The bowl that LIBERO drops onto the ramekin stays on its rim, but one twice as heavy bounces off.
         """
         model, data = self._placed(self.problem.plain), self.data
         for _ in range(FALL):
@@ -108,7 +108,7 @@ class Episode:
         self.problem.scene.models.give_back(model)
 
     def _placed(self, scene: Scene) -> mujoco.MjModel:
-        """Take a model from those of a scene, and move its fixtures to their places."""
+        """Take one of the models of a scene, and move its fixtures to their places."""
         model = scene.models.take()
         model.body_pos[:], model.body_quat[:] = self._places
         return model

@@ -22,7 +22,7 @@ Action: TypeAlias = NDArray[np.float32]
 Vector: TypeAlias = NDArray[np.float64]
 
 GAIN = 30.0
-"""Action per metre of error: 20 would aim at the place itself, behind which the hand lags."""
+"""Action per metre of error. With 20 the hand would aim at the place itself, but it lags behind its goal."""
 TURN_GAIN = 3.0
 """Action per radian of error."""
 OPEN_UP, CLOSE = -1.0, 1.0
@@ -68,7 +68,7 @@ class Sight:
         return place
 
     def point(self, name: str, offset: Vector) -> Vector:
-        """Return the position (3,) of a point of a thing, from the thing's own axes (3,)."""
+        """Return the position (3,) of a point of a thing, at an offset (3,) along the thing's own axes."""
         place: Vector = self.place(name) + _matrix(self._state[thing(name)][3:]) @ offset
         return place
 
@@ -110,8 +110,8 @@ def _move(sight: Sight, way: Vector, fingers: float, axes: Vector = DOWN) -> Act
 def _funnel(way: Vector, clearance: float) -> Vector:
     """Return the way (3,) to a place along a funnel above it, at most `clearance` metres high.
 
-    The further from the place in the plane, the higher. Below the funnel the way leads up first, so that it
-    passes over things.
+    The farther from the place in the plane, the higher the way. Below the funnel it leads up first, so that
+    it passes over things.
     """
     way = way.copy()
     way[2] += min(max(6.0 * (math.hypot(way[0], way[1]) - 0.01), 0.0), clearance)
@@ -126,7 +126,7 @@ class Grip:
     name: str
     """Name of the thing."""
     offset: tuple[float, float, float]
-    """Way in metres from the thing to the place of the grasp."""
+    """Offset in metres from the thing to the place of the grasp."""
     width: float
     """Width in metres of what is between the fingers."""
     yaw: float = 0.0
@@ -134,10 +134,10 @@ class Grip:
     clearance: float = 0.08
     """Height in metres from which the open hand comes down."""
     slant: float = 0.0
-    """Way aside per height by which the hand comes down, along the offset; 0 is straight down."""
+    """Metres aside, along the offset, per metre of height as the hand comes down; 0 is straight down."""
 
     def place(self, sight: Sight) -> Vector:
-        """Return the place (3,) of the grasp, or the place aside of it on the way down with open fingers."""
+        """Return the place (3,) of the grasp, or a place beside it on the way down with open fingers."""
         offset, thing_at = np.array(self.offset), sight.place(self.name)
         if self.slant and not self.is_closed(sight):
             aside = min(max(self.slant * (sight.hand - thing_at - offset)[2], 0.0), 0.07)
@@ -150,7 +150,7 @@ class Grip:
         return sight.opening < self.width + 0.006
 
     def is_missed(self, sight: Sight) -> bool:
-        """Return whether the fingers are closer to each other: the thing is not between them."""
+        """Return whether the fingers are closer than the thing allows: it is not between them."""
         return sight.opening < self.width - 0.006
 
 
@@ -162,7 +162,7 @@ AT_RIM = Grip(BOWL, (-0.034, 0.034, 0.038), 0.004, math.pi / 4)
 AT_RIGHT = Grip(BOWL, (0.0, -0.048, 0.038), AT_RIM.width)
 """The bowl at its rim, on the right."""
 BESIDE_DRAWER = Grip(BOWL, AT_RIM.offset, AT_RIM.width, AT_RIM.yaw, clearance=0.25, slant=1.0)
-"""The same in front of an open drawer, which is above a part of the bowl."""
+"""The same grasp as `AT_RIM` in front of an open drawer, which is above a part of the bowl."""
 ACROSS = Grip(CHEESE, (0.0, 0.0, 0.0), 0.043)
 AT_NECK = Grip(BOTTLE, (0.0, 0.0, 0.132), 0.014)
 """The bottle at its neck: lower down, the palm would touch its top."""
@@ -200,7 +200,7 @@ def _put(
         state: The state (213,).
         grip: Grasp of the thing.
         support: Name of the other thing.
-        offset: Goal of the thing, from the other one's own axes.
+        offset: Goal of the thing, along the other thing's own axes.
         clearance: Height in metres above the goal from which the thing comes down.
     """
     sight = Sight(state)
@@ -211,7 +211,7 @@ def _put(
 
 
 KNOB = np.array([-0.015, 0.0, 0.035])
-"""Way in metres from the stove's place, the axis of its knob, to the middle of the ridge to grasp."""
+"""Offset in metres from the stove's place, the axis of its knob, to the middle of the ridge to grasp."""
 RIDGE = 0.034
 """Opening in metres of the fingers around the ridge."""
 
@@ -234,7 +234,7 @@ BEFORE_STOVE = np.array([-0.03, 0.222])
 def _push_plate(state: State) -> Action:
     """Return the action that pushes the plate from inside its rim: to the left, then toward the robot.
 
-    So it passes by the bowl and the cream cheese.
+    On this way the plate passes the bowl and the cream cheese.
     """
     sight = Sight(state)
     plate = sight.place(PLATE)
@@ -251,7 +251,7 @@ def _push_plate(state: State) -> Action:
 
 TOP, MIDDLE = 0, 1
 BARS = (-0.0028, -0.1016, 0.184), (-0.0028, -0.1016, 0.1104)
-"""Places of the handles of the top and the middle drawer, from the cabinet's own axes."""
+"""Places of the handles of the top and the middle drawer, along the cabinet's own axes."""
 
 
 def _bar(sight: Sight, drawer: int) -> Vector:
@@ -275,7 +275,7 @@ def _open(state: State, drawer: int) -> Action:
 
 
 INSIDE = (0.0033, 0.0113, 0.2)
-"""Goal of the bowl in the closed top drawer, from the cabinet's own axes."""
+"""Goal of the bowl in the closed top drawer, along the cabinet's own axes."""
 
 
 def _open_and_put(state: State) -> Action:
@@ -299,9 +299,9 @@ def _open_and_put(state: State) -> Action:
 OUT_OF = ("in_the_top_drawer_of_the_wooden_cabinet", "on_the_wooden_cabinet")
 """Places from which the bowl is first lifted 25 cm above the plate."""
 FROM_RIGHT = ("between_the_plate_and_the_ramekin", "on_the_cookie_box", "next_to_the_plate")
-"""Places from which the expert takes the bowl at its right. It brought 0.99, 1.00 and 0.97 of the bowls to
-the plate, and 0.91, 0.90 and 0.93 if it took them at the left (60 to 80 episodes). Elsewhere the left is
-better."""
+"""Places from which the expert takes the bowl at its right side. It brought 0.99, 1.00 and 0.97 of these
+bowls to the plate, but 0.91, 0.90 and 0.93 if it took them at the left side (60 to 80 episodes). Elsewhere
+the left side is better."""
 PLACES = (
     *FROM_RIGHT,
     "next_to_the_ramekin",

@@ -27,15 +27,15 @@ _MACROS = "No private macro file", "It is recommended to use a private macro fil
 
 
 def _is_worth_showing(record: logging.LogRecord) -> bool:
-    """Return whether a notice of robosuite is another than the one about settings of its own developers."""
+    """Return whether a notice of robosuite is not the one about settings for its own developers."""
     return not record.getMessage().startswith(_MACROS)
 
 
 def _back_end() -> dict[str, str]:
     """Return the variable that chooses the back end of robosuite's own renderer.
 
-    On Linux robosuite loads EGL where nothing is chosen, and a machine without it fails. GLX loads GLFW, as
-    other systems do. A user's choice of EGL or OSMesa stands: LIBERO's own environment draws with it.
+    On Linux robosuite loads EGL if nothing is chosen, which fails on a machine without EGL. With GLX it loads
+    GLFW, as on other systems. A user's choice of EGL or OSMesa stands: LIBERO's own environment uses it.
     """
     if sys.platform != "linux" or os.environ.get("MUJOCO_GL", "").lower() in ("egl", "osmesa"):
         return {}

@@ -30,8 +30,8 @@ class LiberoVectorWorld:
 
     It is a `clbench.worlds.world.VectorWorld`. Only success ends an episode; the caller counts its steps.
 
-    From the same places of fixtures and the same initial state, all trajectories and successes are LIBERO's.
-    The differences:
+    Given the same places of fixtures and the same initial state, all trajectories and successes equal those
+    of LIBERO. The differences:
 
     1. The seed alone determines an episode. LIBERO places the fixtures (cabinet, stove, rack) anew in each
        reset, and its initial states do not contain them: one initial state leads to many trajectories.
@@ -40,7 +40,7 @@ class LiberoVectorWorld:
     Args:
         lanes: Number of lanes. The first reset to a task compiles its scene.
         threads: Number of threads that advance the physics; MuJoCo releases the interpreter lock. Results do
-            not depend on it. Each thread but one copies the models that it needs, of 3 MB.
+            not depend on their number. Each thread but one copies the models that it needs, of 3 MB.
         perturbed: Whether objects are heavier or lighter, and the arm starts elsewhere.
     """
 
@@ -78,7 +78,7 @@ class LiberoVectorWorld:
     def step(
         self, lanes: Sequence[int], actions: NDArray[np.float32]
     ) -> tuple[State, NDArray[np.float64], NDArray[np.bool_]]:
-        """Move each of `lanes` for one step of 0.05 s by its row of actions (N, 7).
+        """Step each of `lanes` for 0.05 s with its row of the actions (N, 7).
 
         Returns:
             The states (N, 213), the rewards (N,), and which episodes succeeded (N,).
@@ -96,7 +96,7 @@ class LiberoVectorWorld:
 
     @staticmethod
     def recorded_states(task: str, states: NDArray[np.float64], scene: str | None) -> State:
-        """Return the states (T, 213) of a demonstration in a file of LIBERO, of which `states` is another.
+        """Return the states (T, 213) of a demonstration in a file of LIBERO, whose `states` differ in form.
 
         Args:
             task: Name of the task.
@@ -104,7 +104,7 @@ class LiberoVectorWorld:
             scene: The file's `model_file`, a scene in MJCF, which alone says where the fixtures are.
 
         Raises:
-            InputError: The states or the scene are not those of the task, or the scene is missing.
+            InputError: The states or the scene do not belong to the task, or the scene is missing.
         """
         problem = problem_of(task)
         size = problem.starts.shape[1]

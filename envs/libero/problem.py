@@ -23,9 +23,10 @@ from .scene import Places, Scene, Vector, heavier, scene_of
 from .state import THINGS
 
 OVERLAP = 0.008
-"""Largest overlap in metres of two things in a drawn state; others are drawn again. LIBERO's samplers take
-things for circles, and put the bowl up to 7.5 mm into the plate in the 50 stored states of a task. The expert
-brought 8 of 17 bowls to the plate that were deeper, and 59 of 63 others: the physics throws such bowls away.
+"""Largest overlap in metres of two things in a drawn state; other states are drawn again. LIBERO's samplers
+treat things as circles, and put the bowl up to 7.5 mm into the plate in the 50 stored states of a task. Of
+the bowls that were deeper, the expert brought 8 of 17 to the plate, and 59 of 63 other bowls: the physics
+throws deep bowls away.
 """
 
 
@@ -43,11 +44,11 @@ class Problem:
     things: NDArray[np.int64]
     """Bodies of the objects and fixtures in the order of their names."""
     slots: NDArray[np.int64]
-    """Numbers of these among all `THINGS`."""
+    """Numbers of these things among all `THINGS`."""
     parts: NDArray[np.int64]
     """Addresses of the positions of drawers and knobs."""
     fixtures: dict[str, int]
-    """Bodies of the fixtures by name. Their places are no joints, and therefore in no state of LIBERO."""
+    """Bodies of the fixtures by name. Their places are not joints, so no state of LIBERO contains them."""
     lights: dict[int, Predicate]
     """Sites that are drawn while a predicate holds: the burner of a stove, red while the stove is on."""
     original: Any
@@ -57,7 +58,7 @@ class Problem:
         """Return the first state of an episode, as in `starts` (1 + nq + nv,), and the places of all bodies.
 
         Seeds below 50 are numbers of LIBERO's initial states. For any other seed LIBERO draws a state, as it
-        drew those: 50 are too few for demonstrations and test episodes that have none in common.
+        drew those: with only 50, demonstrations and test episodes would have states in common.
         """
         if 0 <= seed < len(self.starts):
             return self.starts[seed], self.places(seed)
@@ -84,9 +85,9 @@ class Problem:
                 return
 
     def places(self, seed: int) -> Places:
-        """Return the places of all bodies in an initial state of LIBERO; its sampler draws those of fixtures.
+        """Return the places of all bodies in an initial state of LIBERO, whose sampler places the fixtures.
 
-        In LIBERO they depend on all resets before, and its initial states do not contain them.
+        In LIBERO they depend on all earlier resets, and its initial states do not contain them.
         """
         positions, quaternions = (part.copy() for part in self.scene.places)
         drawn = _drawn(self.original.placement_initializer, seed)
@@ -98,7 +99,7 @@ class Problem:
         """Return the places of all bodies, with the fixtures where a scene in MJCF has them.
 
         Raises:
-            InputError: The text is no scene of this task.
+            InputError: The text is not a scene of this task.
         """
         positions, quaternions = (part.copy() for part in self.scene.places)
         try:
@@ -168,9 +169,9 @@ def heavier_problem_of(task: str, mass: float) -> Problem:
 
 
 def _overlap(model: mujoco.MjModel, positions: Vector) -> float:
-    """Return by how many metres two things that can move overlap, at most.
+    """Return the largest overlap, in metres, of two things that can move.
 
-    In libero_object all begin up to 4 cm inside the floor, which lifts them at once.
+    In libero_object all things begin up to 4 cm inside the floor, which lifts them at once.
 
     Args:
         model: The scene, with its fixtures in place.

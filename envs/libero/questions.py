@@ -14,7 +14,7 @@ from .state import FINGERS, HAND, State, thing
 MARGIN = 0.02
 """Smallest difference in metres, of places along an axis or of distances, at which there is an answer."""
 TABLE = 0.9
-"""Height in metres of the table's top; places of the bowl and of the bottle are those of their bottoms."""
+"""Height in metres of the table's top; the places of the bowl and the bottle are those of their bottoms."""
 
 Numbers = NDArray[np.float32]
 

@@ -44,7 +44,7 @@ def goal_of(env: Any, model: mujoco.MjModel) -> list[Predicate]:
 
 
 def _on(env: Any, model: mujoco.MjModel, thing: str, support: str) -> Predicate:
-    """Whether a thing lies on an object, or on a region of the table or of an object."""
+    """Return the predicate that a thing lies on an object, or on a region of the table or of an object."""
     body = _body(env, model, thing)
     if support not in env.object_sites_dict:
         below, touching = _body(env, model, support), _touching(env, model, thing, support)
@@ -68,7 +68,7 @@ def _on(env: Any, model: mujoco.MjModel, thing: str, support: str) -> Predicate:
 
 
 def _in(env: Any, model: mujoco.MjModel, thing: str, container: str) -> Predicate:
-    """Whether the centre of a thing is inside the box of a region."""
+    """Return the predicate that the centre of a thing is inside the box of a region."""
     body, region, site = (
         _body(env, model, thing),
         env.object_sites_dict[container],
@@ -118,7 +118,7 @@ def _body(env: Any, model: mujoco.MjModel, thing: str) -> int:
 
 
 def _touching(env: Any, model: mujoco.MjModel, one: str, other: str) -> Predicate:
-    """Whether two objects touch each other."""
+    """Return the predicate that two objects touch each other."""
     of_one, of_other = _geoms(env, model, one), _geoms(env, model, other)
 
     def touching(data: mujoco.MjData) -> bool:

@@ -224,8 +224,8 @@ GOAL = Scenario(
 """The ten tasks of libero_goal: five skills to keep, four targets, and a held-out combination of two.
 
 The skills carry the bowl or the bottle to five places. Each target has a motion of its own: pull, carry
-another thing, turn and push. Evaluations are half as many as in Fetch-v1, and demonstrations a quarter: a
-step costs nine times as much.
+another thing, turn and push. There are half as many evaluation episodes as in Fetch-v1, and a quarter of the
+demonstrations: a step costs nine times as much.
 """
 
 SPATIAL = Scenario(

@@ -36,7 +36,7 @@ class Scene:
     xml: str
     """The scene in MJCF."""
     model: mujoco.MjModel
-    """The scene without what is only seen, which needs 95 % of the memory, and without its unused sensors."""
+    """The scene without unused sensors, and without the parts that are only seen: 95 % of its memory."""
     models: Copies[mujoco.MjModel]
     """The model, for threads that advance episodes at the same time: each moves the fixtures in its own."""
     places: Places
@@ -87,7 +87,7 @@ def heavier(scene: Scene, mass: float) -> Scene:
 
 
 def _copies(model: mujoco.MjModel) -> Copies[mujoco.MjModel]:
-    """Return the model with copies of it, of 3 MB."""
+    """Return the model with its copies, of 3 MB each."""
     return Copies(model, lambda: copy.copy(model))
 
 

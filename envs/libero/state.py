@@ -4,9 +4,9 @@ x grows away from the robot, y to its left, z up. Quaternions begin with their s
 place in the states of all scenes, in the order of `THINGS`. A scene has seven of the 20 things; the numbers
 of the others are 0, and so are joints of fixtures that it lacks.
 
-Positions of things are from the hand, and once more at a finer scale. A policy kept .81 of the skills of
-libero_goal with places in the room, .88 with positions from the hand, and .95 with the finer scale as well
-(90 to 150 validation episodes): it had missed the neck of the bottle by 1.3 cm or more.
+Positions of things are relative to the hand, and appear once more at a finer scale. A policy kept .81 of the
+skills of libero_goal with places in the room, .88 with positions relative to the hand, and .95 with the finer
+scale as well (90 to 150 validation episodes): before, it missed the neck of the bottle by 1.3 cm or more.
 """
 
 from __future__ import annotations
@@ -60,10 +60,10 @@ JOINTS = slice(PLACES.stop, PLACES.stop + PARTS)
 CLOSE_BY = slice(JOINTS.stop, SIZE)
 """Positions from the hand once more, cut at 5 cm (`REACH`) along each axis: three numbers for each."""
 REACH = 0.05
-"""Metres. A policy scales each number by its spread, which is smaller for numbers that are cut."""
+"""Limit in metres. A policy scales each number by its spread, which is smaller for numbers that are cut."""
 
 
 def thing(name: str) -> slice:
-    """Return where the thing of this name has its position (3,) from the hand and its quaternion (4,)."""
+    """Return where a thing has its position (3,) relative to the hand, and its quaternion (4,)."""
     first = PLACES.start + 7 * THINGS.index(name)
     return slice(first, first + 7)

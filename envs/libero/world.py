@@ -15,4 +15,4 @@ class LiberoWorld(MujocoWorld):
     vector_world = LiberoVectorWorld
     first_task = "open_the_middle_drawer_of_the_cabinet"
     predicates = PREDICATES
-    """What the goals of all tasks are made of: with it, the rule is part of the definition of a scenario."""
+    """The predicates in the goals of all tasks: through them, rules are part of a scenario's definition."""

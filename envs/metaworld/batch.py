@@ -1,7 +1,7 @@
 """Episodes side by side: the work of `Episode.advance`, done for all of them at once.
 
-Each number has the same bits as there; the module `rewards` explains how. Rewards and successes depend on the
-task, so they are computed in groups of episodes of one task.
+Each number has the same bits as in `Episode.advance`; the module `rewards` explains how. Rewards and
+successes depend on the task, so they are computed in groups of episodes of one task.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ PHYSICS = ("model", "data", "mujoco_renderer", "init_left_pad", "init_right_pad"
 
 
 class Episode(SawyerXYZEnv):
-    """The differences of an episode from Meta-World's environment; each task has a subclass of both.
+    """An episode, with its differences from Meta-World's environment; each task has a subclass of both.
 
     1. The goal is part of the state: Meta-World's experts need it.
     2. The seed determines everything. In Meta-World the first state can still show objects where they were in

@@ -66,7 +66,7 @@ def _straddling(group: Group, radius: float, close: float) -> tuple[Vector, Vect
 
 
 def _checked(margin: Vector) -> Vector:
-    """Return a margin (N,).
+    """Return a margin (N,) unless it is negative somewhere.
 
     Raises:
         InputError: A margin is negative, which Meta-World's reward does not allow.

@@ -27,7 +27,7 @@ _Kind: TypeAlias = tuple[str, float | None]
 
 @dataclass(eq=False)
 class _Lane:
-    """An episode in its lane; the next episode there is another object."""
+    """An episode in its lane; the next episode in the lane is another `_Lane`."""
 
     kind: _Kind
     episode: Episode
@@ -38,7 +38,7 @@ class _Order:
 
     Args:
         lanes: The lanes that take the step.
-        known: Groups of the previous order; unchanged ones are used again.
+        known: Groups of the previous order; unchanged ones are reused.
     """
 
     def __init__(self, lanes: Sequence[_Lane], known: Mapping[tuple[_Lane, ...], Group]) -> None:
@@ -70,7 +70,7 @@ class MetaWorldVectorWorld:
     Args:
         lanes: Number of lanes. The first reset to a task compiles its scene.
         threads: Number of threads that advance the physics; MuJoCo releases the interpreter lock. Results do
-            not depend on it. Each thread but one copies the models that it needs, of 19 MB.
+            not depend on their number. Each thread but one copies the models that it needs, of 19 MB.
         perturbed: Whether objects are heavier or lighter, and the hand starts elsewhere.
     """
 
@@ -106,7 +106,7 @@ class MetaWorldVectorWorld:
     def step(
         self, lanes: Sequence[int], actions: NDArray[np.float32]
     ) -> tuple[State, NDArray[np.float64], NDArray[np.bool_]]:
-        """Move each of `lanes` for one step of 0.0125 s by its row of actions (N, 4).
+        """Step each of `lanes` for 0.0125 s with its row of the actions (N, 4).
 
         Returns:
             The states (N, 39), the rewards (N,), and which episodes succeeded (N,).

@@ -40,8 +40,8 @@ def magnitude(numbers: Vector) -> Vector:
 def _square(numbers: Vector) -> Vector:
     """Return the squares with the bits of Meta-World's `**` of one number.
 
-    That calls the C library's pow, whose last bit differs from a product once in a thousand times.
-    `float_power` also calls pow, while `**` of an array multiplies.
+    For one number, `**` calls the C library's pow, whose last bit differs from a product once in a thousand
+    times. `float_power` also calls pow, while `**` of an array multiplies.
     """
     squares: Vector = np.float_power(numbers, 2.0)
     return squares
@@ -61,7 +61,7 @@ def gaussian(distances: Vector) -> Vector:
 def near(
     distances: Vector, radius: float, margin: Vector | float, sigmoid: Callable[[Vector], Vector] = long_tail
 ) -> Vector:
-    """Return 1 where a distance is within a radius, and less with the margins beyond it.
+    """Return 1 where a distance is within a radius, and less beyond it, depending on the margin.
 
     It equals Meta-World's `tolerance` with 0 as the lower bound, as no distance is negative.
     """
@@ -70,7 +70,7 @@ def near(
 
 
 def between(numbers: Vector, low: float, high: float, margin: Vector) -> Vector:
-    """Return 1 where a number is from `low` to `high`, and less with the margins outside."""
+    """Return 1 where a number is from `low` to `high`, and less outside, depending on the margin."""
     outside = np.where(numbers < low, low - numbers, numbers - high) / margin
     value: Vector = np.where((low <= numbers) & (numbers <= high), 1.0, long_tail(outside))
     return value
@@ -88,9 +88,9 @@ def hamacher(first: Floats, second: Floats) -> Floats:
 class Mixed:
     """Numbers with mixed precision, as Meta-World derives them from the action of the fingers.
 
-    An action has single precision, and keeps it when numbers of Python are added or multiplied. If it is
-    clipped to 0 or to the largest effort it becomes such a number itself, and everything derived has double
-    precision.
+    An action has single precision, and keeps it when Python numbers are added or multiplied. If it is clipped
+    to 0 or to the largest effort, it becomes a Python number itself, and everything derived from it has
+    double precision.
     """
 
     numbers: Vector
@@ -99,7 +99,7 @@ class Mixed:
     """Mask of the numbers with single precision (N,)."""
 
     def into(self, formula: Callable[..., Floats], *others: Vector) -> Mixed:
-        """Apply a formula to these numbers and others (N,), which are numbers of Python in Meta-World."""
+        """Apply a formula to these numbers and others (N,), which are Python numbers in Meta-World."""
         numbers = formula(self.numbers, *others)
         if self.single.any():
             rounded = (part.astype(np.float32) for part in (self.numbers, *others))

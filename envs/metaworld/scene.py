@@ -33,7 +33,7 @@ class Scene:
     """The physics with the hand at its start."""
     models: Copies[tuple[mujoco.MjModel, Vector, Vector]] = field(init=False)
     """The model with views of its places, for threads that advance episodes at the same time: each moves the
-    bodies in its own, of 19 MB. A view made in each step would cost time."""
+    bodies in its own copy, of 19 MB. Making the views anew in each step would cost time."""
 
     def __post_init__(self) -> None:
         model = self.model

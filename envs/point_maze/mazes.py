@@ -2,8 +2,8 @@
 
 All have a hub in the middle with a passage to each side. They differ in the ways to the corners: in the red
 maze these lead through the upper and the lower room, in the blue maze through the left and the right room.
-The green maze has the upper corners of the blue one and the lower corners of the red one. So a room has the
-same place in every maze, but the way to it begins in another direction.
+The green maze has the upper corners of the blue one and the lower corners of the red one. A room therefore
+has the same place in every maze, but the way to it begins in another direction.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Maze:
 
     @cached_property
     def _ways(self) -> dict[str, dict[Cell, tuple[Cell, int]]]:
-        """For each room and cell: the next cell on the shortest way to the room, and the cells to go."""
+        """For each room and cell: the next cell on the shortest way to the room, and the cells left to go."""
         return {room: self._ways_to(goal) for room, goal in ROOMS.items()}
 
     def _ways_to(self, goal: Cell) -> dict[Cell, tuple[Cell, int]]:

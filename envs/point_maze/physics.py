@@ -108,7 +108,7 @@ class PointMazeVectorWorld:
     def step(
         self, lanes: Sequence[int], actions: NDArray[np.float32]
     ) -> tuple[State, NDArray[np.float64], NDArray[np.bool_]]:
-        """Move each of `lanes` for one step of 0.1 s by its row of actions (N, 2).
+        """Step each of `lanes` for 0.1 s with its row of the actions (N, 2).
 
         Returns:
             The states (N, 11), the rewards (N,), and which episodes succeeded (N,).

@@ -31,7 +31,7 @@ FLOOR, BALL, GOAL = (0.75, 0.75, 0.72), (0.10, 0.10, 0.10), (0.95, 0.75, 0.10)
 def scene(colour: str) -> mujoco.MjModel:
     """Return the compiled scene of a maze. All worlds of a process share it and only read it.
 
-    It equals gymnasium-robotics' scene of the same map. That library leaves a file behind when it builds it.
+    It equals gymnasium-robotics' scene of the same map, but building it there would leave a file behind.
     """
     specification = mujoco.MjSpec.from_file(str(_point_file()))
     for cell in _walls(colour):

@@ -36,7 +36,7 @@ from .symmetry import SYMMETRIES
 TEST_EPISODES = 100
 """Number of episodes that measure the mean return and the success of an expert."""
 VALIDATION_EPISODES = 10
-"""Number of other episodes after each segment, which choose the best actor, the latest of equals."""
+"""Number of other episodes after each segment, which choose the best actor; the latest of equals wins."""
 ROUND = 8
 """Decisions between updates; each update takes half as many gradient steps."""
 REPLAY_SIZE = 100_000
@@ -151,7 +151,7 @@ def checkpoint_path(settings: Settings) -> Path:
 
 @dataclass
 class _Best:
-    """The best actor so far, and the results of all."""
+    """The best actor so far, and the results of all actors."""
 
     actor: dict[str, Tensor]
     value: float
@@ -165,7 +165,7 @@ def train(
     """Train an expert, write its weights and its JSON to `folder`, and return the content of the JSON.
 
     An interrupted training continues from its checkpoint in the cache. If a symmetry derives the expert from
-    another task's expert, that one is trained, and the derived one is measured on its own task.
+    another task's expert, the other expert is trained, and the derived one is measured on its own task.
 
     Args:
         settings: Inputs that determine the weights.
