@@ -144,8 +144,8 @@ def work_of(entry: Entry, batch: Batch) -> list[Work]:
 def by_width(spans: list[tuple[int, int]], rounds: int, generator: np.random.Generator) -> dict[str, Any]:
     """Return times of the head as ratios, by width of the policy.
 
-    `chunk`: easy-first decoding to the given forwards with kept keys. `forward`: a forward of all tokens to
-    one of a block.
+    `chunk`: the time of easy-first decoding divided by that of the given forwards with kept keys. `forward`:
+    the time of a forward of all tokens divided by that of a forward of one block.
     """
     return {
         str(width): {

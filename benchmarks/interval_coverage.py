@@ -265,7 +265,7 @@ def seed_deviations(records: Path) -> dict[str, dict[str, float]]:
 
 
 def _excess(metric: str, runs: list[Scores]) -> tuple[float, float]:
-    """Return the variance of a metric between runs less the jackknife variance of their episodes.
+    """Return the variance of a metric between runs minus the jackknife variance of their episodes.
 
     The second value is the variance of a success at the mean rate, divided by that at one half.
     """
@@ -283,7 +283,7 @@ def _excess(metric: str, runs: list[Scores]) -> tuple[float, float]:
 Row = dict[str, Any]
 """A row of the results."""
 QUANTITIES = ("rate", "difference")
-"""Of the intervals."""
+"""Quantities whose intervals are simulated."""
 Lines = dict[str, Row]
 """Lines or columns of a table, with the values that a row of the results must have to belong there."""
 

@@ -55,7 +55,7 @@ words.
 
 
 def main() -> None:
-    """Measure the scenarios that are named, all if none is, and write the results and the page."""
+    """Measure the named scenarios, or all if none is named, and write the results and the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("ids", nargs="*", default=SCENARIOS, help="Gymnasium ids of scenarios")
     for name in parser.parse_args().ids:
@@ -98,7 +98,7 @@ def _first_states(task: Task, episodes: int) -> tuple[Any, NDArray[np.float32]]:
 
 
 def rate(task: Task, act: Act, episodes: int) -> float:
-    """Return the share of episodes of a task in which acting so succeeds within the horizon."""
+    """Return the share of episodes of a task in which `act` succeeds within the horizon."""
     world, states = _first_states(task, episodes)
     running = list(range(episodes))
     for _ in range(task.horizon):
@@ -113,7 +113,7 @@ def rate(task: Task, act: Act, episodes: int) -> float:
 
 
 def known(scenario: Scenario, episodes: int) -> dict[str, float]:
-    """Return for each task in how many of half of its episodes the first state tells it."""
+    """Return for each task the share of half of its episodes in which the first state tells the task."""
     states, labels = [], []
     for task in scenario.tasks:
         world, first = _first_states(task, episodes)

@@ -2,7 +2,7 @@
 
 The records have the shape of Fetch-v1's. A method is two numbers: how well it learns, and how much it keeps.
 The goal is less than 3 MB and 20 s. Where Chromium is installed, the published page is opened, too: it should
-show its first text within a second of an empty page's.
+show its first text at most a second later than an empty page does.
 """
 
 from __future__ import annotations

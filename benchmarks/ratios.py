@@ -16,11 +16,11 @@ def take_turns(
 ) -> list[dict[str, float]]:
     """Return what was measured in each round, by name.
 
-    The order is new in each round, so that other work on the machine affects all alike. A further round comes
-    first and does not count: it warms up.
+    The order is new in each round, so that other work on the machine affects all alike. An extra round comes
+    first as a warm-up and does not count.
 
     Args:
-        measurements: Functions that measure something in the round of a number.
+        measurements: Functions that measure something, given the number of the round.
         rounds: Number of rounds that count.
         generator: Source of the orders.
         description: Text of the progress bar.

@@ -27,7 +27,7 @@ def write_results(name: str, values: Mapping[str, Any], folder: Path | None = No
 
 
 def write_row(name: str, table: str, row: str, values: Mapping[str, Any]) -> None:
-    """Write a row of a table in results/`name`.json; other rows stay, which other machines may have measured.
+    """Write a row of a table in results/`name`.json; other rows stay, perhaps from other machines.
 
     Args:
         name: Name of the benchmark.

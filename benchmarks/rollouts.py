@@ -3,9 +3,9 @@
 Contenders take turns in blocks of steps, in a new order each round, so that other work on the machine affects
 all of them equally. A ratio compares two blocks of one round; the results are the median over rounds and its
 95 % bootstrap interval. All take the same random actions and start a new episode when one ends. The peers
-step the suite's own environment, which has our physics, with the same simulated time per step; the physics
-alone is the same number of threads that only call `mujoco.mj_step` on it. For
-LIBERO, it steps LIBERO's whole model, visual geoms included, and the arm stands still.
+step the suite's own environment, which has our physics, with the same simulated time per step. The physics
+alone is the same number of threads that only call `mujoco.mj_step` on this environment's model. For LIBERO,
+it steps LIBERO's whole model, visual geoms included, and the arm stands still.
 
     python benchmarks/rollouts.py fetch libero
 
@@ -318,7 +318,7 @@ class Raw:
         self.data = [mujoco.MjData(physics.model) for _ in range(num_envs)]
         self.threads, self.pool = threads, ThreadPoolExecutor(threads)
         self.done = 0
-        """Steps of each copy so far: an episode goes on in the next block, as those of the others do."""
+        """Steps of each copy so far: an episode goes on in the next block, as the others' episodes do."""
 
     def run(self, actions: Actions) -> None:
         """Step each copy by its actions (steps, num_envs, A)."""

@@ -3,8 +3,8 @@
 Each quantity is measured at several sizes in turns, in a new order each round; the results are the medians,
 the straight line through them and their distance from it. Tasks come from Meta-World, each with its own
 scene, and episodes from Fetch, both with an untrained policy, whose episodes last to their horizons. Numbers
-of episodes are multiples of the 40 that step together, because fewer episodes need a forward pass of as many
-rows.
+of episodes are multiples of the 40 that step together, because fewer episodes need a forward pass with just
+as many rows.
 """
 
 from __future__ import annotations

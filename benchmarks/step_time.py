@@ -1,11 +1,11 @@
-"""Cost of an adaptation step of each method, as a ratio to plain fine-tuning: `make benchmark`.
+"""Cost of an adaptation step of each method, relative to plain fine-tuning: `make benchmark`.
 
 Methods take turns in blocks of steps, in a new order each round, so that other work on the machine affects
 all of them equally. A ratio compares two blocks of one round; the results are the median over rounds and its
-95 % bootstrap interval. The steps are those of the first target of a run, by its trainer. The limit is a bare
-PyTorch loop of the same model on batches in memory: the additional time of plain fine-tuning is the cost of
-hooks, sources and checks. Every run measures the same ratio, at its end and less precisely, for the board's
-costs (`clbench.runs.step_time`).
+95 % bootstrap interval. The steps are those that the trainer of a run takes on the first target. The limit is
+a bare PyTorch loop of the same model on batches in memory: the additional time of plain fine-tuning is the
+cost of hooks, sources and checks. Every run measures the same ratio, at its end and less precisely, for the
+board's costs (`clbench.runs.step_time`).
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Bench:
         self.trainer.prepare()
 
     def seconds(self, steps: int) -> float:
-        """Return the time of `steps` steps in seconds, after a first step that makes the optimiser."""
+        """Return the time of `steps` steps in seconds, after a first step that creates the optimiser."""
         marks: list[float] = []
 
         def after(step: Step) -> bool:

@@ -117,7 +117,7 @@ class WalkerWorld(OneLaneWorld):
 
 
 QUESTIONS = ()
-"""Nobody is asked, but the length of texts counts questions, too."""
+"""No questions are asked, but the length of texts depends on questions, too."""
 WALK = Task("walk", "dm_control", ("walk",), 100, "walker:WalkerWorld", "walker:nobody")
 SCENARIO = Scenario(
     id=ID,

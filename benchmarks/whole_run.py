@@ -112,9 +112,9 @@ def measure(run: ResolvedRun) -> dict[str, Any]:
 
 
 def _counted_steps() -> list[int]:
-    """Return a list that gets the number of environments of each step from now on.
+    """Return a list to which each step from now on adds its number of environments.
 
-    The lengths of a record's episodes are too few: checks of a criterion have steps, too.
+    The lengths of a record's episodes are not enough: checks of a criterion take steps, too.
     """
     steps: list[int] = []
     step = Lanes.step

@@ -2,7 +2,7 @@
 
 One worker, one worker per core and a Ray cluster on this machine take turns at the same runs: methods whose
 runs take about as long as one of plain fine-tuning, on the first target. A first round puts everything that
-the runs need into the cache, and does not count. The cluster, and the process of each of its workers that has
+the runs need into the cache, and does not count. The cluster, and in each of its workers the process that has
 imported everything, start before the clock; the time of the start is reported separately. The records must be
 equal except for their times.
 """

@@ -38,17 +38,17 @@ def compare(
 ) -> pandas.DataFrame:
     """Compare methods on a scenario: do the runs that have no record, and return their rows of the board.
 
-    Plain fine-tuning, "sft", always runs as well: without it a row says nothing. All methods meet the same
-    seeds, and rows count these seeds alone, even where the folder has more.
+    Plain fine-tuning, "sft", always runs as well, because without it a row says nothing. All methods run with
+    the same seeds, and rows count only these seeds, even where the folder has more.
 
     Args:
         scenario: Gymnasium id of the scenario; "module:id" imports the module first.
-        methods: One method or several: classes, installed names, or "module:Class". Classes of a notebook run
-            one after the other, see `clbench.run`.
+        methods: One method or several: classes, installed names, or "module:Class". Classes from a notebook
+            run one after the other, see `clbench.run`.
         seeds: Number of seeds.
         first_seed: The first seed, below 100: no board shows the seeds for tuning.
         policy: Name of the policy, such as "discrete_diffusion", "flow-base" or "module:Class".
-        records: Folder of the records. Those of other methods are not read.
+        records: Folder of the records. Records of other methods are not read.
         workers: Number of runs at once, each a process with one thread; all cores if None, or all
             GPUs with the device "cuda".
         device: Device that runs the policies, for example "cpu" or "cuda".

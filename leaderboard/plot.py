@@ -25,18 +25,18 @@ __all__ = ["curves", "frontier", "matrix", "plane"]
 
 
 def matrix(runs: Record | Iterable[Record] | Path | str, *, dark: bool = False) -> Plot:
-    """Return the success after each stage (rows) on each task (columns), the mean of runs of one method.
+    """Return a chart of the success after each stage (rows) on each task (columns), averaged over runs.
 
     A frame marks the task that a stage learned. Targets have numbers if the runs learned them in different
     orders.
 
     Args:
-        runs: A record, several records, or the path of a record or of a folder of them.
+        runs: A record, several records of one method, or the path of a record or of a folder of records.
         dark: Whether to use the colours for a dark page.
 
     Raises:
-        InputError: There is no record, or they are of several methods, or of different scenarios.
-        RecordError: A file is no record, or its run failed.
+        InputError: There is no record, or the records are of several methods or of different scenarios.
+        RecordError: A file is not a record, or its run failed.
     """
     from .views.page.charts.picture import themed
     from .views.page.runs import Runs, matrix_of
@@ -50,17 +50,17 @@ def curves(
     *,
     dark: bool = False,
 ) -> Plot:
-    """Return the success along the stages, on the old skills and on each stage's target, with intervals.
+    """Return a chart of the success along the stages, on the old skills and each target, with intervals.
 
     Args:
-        runs: A record, several records of one method, or the path of a record or of a folder of them.
-        sft: The same of plain fine-tuning, to compare the old skills with; None to leave it out.
+        runs: A record, several records of one method, or the path of a record or of a folder of records.
+        sft: The same for plain fine-tuning, to compare the old skills with; None to leave it out.
         dark: Whether to use the colours for a dark page.
 
     Raises:
-        InputError: There is no record, or they are of several methods, or of different scenarios; or `sft`
-            has runs of another method.
-        RecordError: A file is no record, or its run failed.
+        InputError: There is no record, the records are of several methods or of different scenarios, or
+            `sft` has runs of another method.
+        RecordError: A file is not a record, or its run failed.
     """
     from .views.page.charts.picture import themed
     from .views.page.runs import Runs, curves_of
@@ -70,7 +70,7 @@ def curves(
 
 
 def plane(records: Path | str = RECORDS, scenario: str | None = None, *, dark: bool = False) -> Plot:
-    """Return the methods of a scenario: kept skills against learned targets, with intervals.
+    """Return a chart of the methods of a scenario: kept skills against learned targets, with intervals.
 
     The line below the title names the methods that are far from the others, or have no such values.
 
@@ -99,7 +99,7 @@ def plane(records: Path | str = RECORDS, scenario: str | None = None, *, dark: b
 
 
 def frontier(records: Path | str = RECORDS, scenario: str | None = None, *, dark: bool = False) -> Plot:
-    """Return what the methods of a scenario learn and keep at each learning rate of the ladder.
+    """Return a chart of what the methods of a scenario learn and keep at each learning rate of the ladder.
 
     The records of the ladder are in the folder `ladder` next to the folder of the records.
 
@@ -142,7 +142,7 @@ def _records(runs: Record | Iterable[Record] | Path | str) -> list[Record]:
 
 
 def _chosen(scenario: str | None, counts: Mapping[str, int], what: str, folder: Path | str) -> str:
-    """Return a scenario that was asked for, or the one that has most."""
+    """Return the scenario that was asked for, or else the one with the highest count."""
     if not counts:
         raise InputError(f"No record in {folder} makes a {what}; `clbench leaderboard` says why.")
     chosen = scenario or max(counts, key=counts.__getitem__)

@@ -1,8 +1,8 @@
 """The folder `site` next to the records: every form of the board, and what it was made from.
 
-Computing the board takes half a minute, most of it for intervals. Therefore the folder keeps the numbers in
-`board.json`, with hashes of what they were computed from, and of themselves. They are read back while nothing
-of it changes.
+Computing the board takes half a minute, most of it for intervals. The folder therefore keeps the numbers in
+`board.json`, with hashes of their inputs and of the files themselves, and reads them back until one of these
+changes.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ def site_of(records: Path) -> Path:
 
 
 def add_published(records: Path) -> int:
-    """Copy the published records, with their verifications, to a folder of records; what is there stays.
+    """Copy the published records, with their verifications, to a folder of records; existing files stay.
 
-    The ladder goes beside it: without plain fine-tuning at the settings that tied in tuning, no gain over it
-    is certain.
+    The ladder is copied beside it: without plain fine-tuning at the settings that tied in tuning, no gain
+    over it is certain.
 
     Returns:
         The number of records that were missing in the folder itself.
@@ -71,9 +71,9 @@ def add_published(records: Path) -> int:
 
 
 def inputs_of(records: Path) -> dict[str, str]:
-    """Return the hashes of all that the board of a folder of records is made from.
+    """Return the hashes of everything that the board of a folder of records is made from.
 
-    Ask before the records are read: a record that arrives in between then changes the hash.
+    Call it before the records are read: a record that arrives in between then changes the next hash.
     """
     pictures = sorted([*CARDS.glob("*/*.webp"), *CARDS.glob(f"*/{FILM}")])
     packages = {package_of(entry.value) for entry in installed_methods().values()}
@@ -148,13 +148,13 @@ def write_site(board: Board, records: Path, inputs: dict[str, str]) -> dict[Path
     sweep(site)
     former = _files_of(site)
     written = write_all({site / name: text for name, text in texts.items()})
-    for name in former - texts.keys():  # such as the picture of a frontier that is no more
+    for name in former - texts.keys():  # such as the picture of a frontier that no longer exists
         (site / name).unlink(missing_ok=True)
     return written
 
 
 def _files_of(site: Path) -> set[str]:
-    """Return the names of the files that the board of a folder was written to; none if that is unknown."""
+    """Return the names of the files that the board of a folder was written to; empty if that is unknown."""
     try:
         names = json.loads(_read_own(site / NUMBERS))["files"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):

@@ -1,4 +1,4 @@
-"""ConSFT's weights of samples, which its variants and controls share."""
+"""ConSFT's sample weights, which its variants and controls share."""
 
 import math
 from abc import ABC, abstractmethod
@@ -22,9 +22,9 @@ SLICES = 10
 """Number of equal parts of the schedule. Each part has its own histogram; the last one also counts the steps
 after the schedule."""
 LEARNED_AFTER = 4.0
-"""Sum of step factors after which plain fine-tuning has learned a target of MetaWorld-v1: in the median 3.5
-to 4.6, whether the step factor is 1 or 0.0165 (tuning records, seeds 100 and 101). The median is 7 to 9 on
-Fetch-v1 below a factor of 1, 16.5 at 1, and 12.4 to 16 on PointMaze-v1: see detail 3 of `consft`."""
+"""Sum of step factors after which plain fine-tuning has learned a target of MetaWorld-v1. The median is 3.5
+to 4.6, whether the step factor is 1 or 0.0165 (tuning records, seeds 100 and 101). On Fetch-v1, it is 7 to 9
+below a factor of 1 and 16.5 at 1, and on PointMaze-v1 12.4 to 16: see detail 3 of `consft`."""
 
 
 @dataclass
@@ -96,7 +96,7 @@ class WeightedSFT(Method, ABC):
         return (weights * losses).mean()
 
     def diagnostics(self) -> dict[str, Any]:
-        """Return the histogram of the weights, with the bins `omega_edges`, by tenth of the schedule."""
+        """Return the histogram of the weights for each tenth of the schedule, with its bins `omega_edges`."""
         if not hasattr(self, "counts"):
             return {}
         return {"omega_edges": list(BINS), "omega_counts": self.counts.tolist()}
@@ -104,7 +104,7 @@ class WeightedSFT(Method, ABC):
 
 @dataclass
 class CalibratedSFT(WeightedSFT, ABC):
-    """Fine-tune on a weighted loss, which is scaled inside the weights: its unit differs between policies."""
+    """Fine-tune on a weighted loss, scaled inside the weights, because its unit differs between policies."""
 
     loss_scale: float = 0.003
 

@@ -1,4 +1,4 @@
-"""Directions of blocks of parameters: A-GEM's one-sided projection, and random directions for controls."""
+"""Operations on blocks of gradients: A-GEM's one-sided projection, and random directions for controls."""
 
 from collections.abc import Sequence
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def inner(first: Sequence[Tensor], second: Sequence[Tensor]) -> float:
-    """Return the inner product of two blocks of tensors of equal shapes."""
+    """Return the inner product of two blocks of tensors with equal shapes."""
     return float(
         sum(torch.dot(one.flatten(), other.flatten()) for one, other in zip(first, second, strict=True))
     )

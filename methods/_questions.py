@@ -1,4 +1,4 @@
-"""Batches of demonstrations and questions, in the proportion of pretraining."""
+"""Batches of demonstrations and questions, in the same proportion as in pretraining."""
 
 from clbench.learning.prior import Source
 from clbench.policy.batch import Batch, QuestionBatch

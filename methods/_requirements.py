@@ -18,10 +18,10 @@ def in_range(name: str, value: float, low: float, high: float = float("inf")) ->
 
 
 def one_of(name: str, value: str, allowed: Collection[str]) -> None:
-    """Refuse a hyper-parameter that is none of the allowed words.
+    """Refuse a hyper-parameter that is not one of the allowed words.
 
     Raises:
-        ValueError: `value` is none of them; the message names the nearest one.
+        ValueError: `value` is not one of them; the message names the nearest one.
     """
     if value not in allowed:
         hint = did_you_mean(value, allowed)

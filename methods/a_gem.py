@@ -1,12 +1,13 @@
 """A-GEM: no gradient raises, to first order, the loss on prior demonstrations (arXiv 1812.00420).
 
 Let g be the gradient on the target and r the gradient on a batch of prior demonstrations. If their inner
-product is negative, the step uses g - (g.r / ||r||^2) r instead of g (Eq. 11). AEGIS projects layer by layer,
-against activations.
+product is negative, the step uses g - (g.r / ||r||^2) r instead of g (Eq. 11). AEGIS, in contrast, projects
+layer by layer, against the gradient of a distance between hidden states.
 
 Details:
-1. The memory holds all prior demonstrations, as in experience replay. A batch from it has the budget's size
-   and comes on top of the target's, so a step reads twice the samples of a step of experience replay.
+1. The memory holds all prior demonstrations, as in experience replay. A batch from the memory has the
+   budget's size and is added to the target's batch, so a step reads twice as many samples as a step of
+   experience replay.
 2. There is one projection for all weights together.
 3. If there is no earlier task, the gradient on the target is not changed.
 4. The projected gradient is clipped and goes through Adam, whose step may still raise the prior loss; the
@@ -44,7 +45,7 @@ class AGEM(Method):
         return policy.action_loss(demonstrations).mean()
 
     def gradients(self, policy: Policy, loss: Tensor) -> None:
-        """Set the projected gradients of the target."""
+        """Set the gradients of the loss on the target, projected against the prior demonstrations."""
         loss.backward()  # type: ignore[no-untyped-call]
         if self.remembered is None:
             return

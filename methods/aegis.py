@@ -6,32 +6,33 @@ layer form a diagonal Gaussian: the anchor. Each step differentiates the action 
 a negative inner product d, a step that lowers the loss would raise the distance. The part of the loss's
 gradient along the anchor's gradient is then removed: g - d / ||g_anchor||^2 g_anchor (Eq. 12 and 13).
 
-Formulas and constants are from notes by other readers of the paper. We have read its abstract only: "the
-paper" below is the paper as these notes describe it. Where they do not say what it does, a detail calls what
-we do "our choice".
+The formulas and constants come from other readers' notes on the paper. We have read only its abstract: below,
+"the paper" means the paper as these notes describe it. Where the notes are silent, a detail marks what we do
+as "our choice".
 
 Details:
-1. The anchor is computed on the benchmark's training questions instead of 3,000 questions of VQAv2, from all
-   tokens except padding (our choice). Mean and deviation are kept per channel: the paper writes "means and
-   variances" of a layer, and its distance is exact for diagonal Gaussians.
+1. The anchor is computed from the benchmark's training questions instead of 3,000 questions from VQAv2, over
+   all tokens except padding (our choice). The mean and the deviation are kept per channel: the paper writes
+   "means and variances" of a layer, and its distance is exact for diagonal Gaussians.
 2. The hidden state is the output of each backbone layer. The statistics of a step come from its batch. Both
    are our choice.
-3. The block of a layer holds all weights that it trains. Weights outside the backbone's layers (embeddings,
-   action head, answer head) keep the loss's gradient. Both are our choice.
+3. The block of a layer holds all of the layer's trained weights. Weights outside the backbone's layers
+   (embeddings, action head, answer head) keep the loss's gradient. Both are our choice.
 4. The paper adds eps to the norm, which leaves a small negative product. Here the division is exact, and an
    anchor gradient of norm 0 does not change the block.
 5. The distance is summed over channels and, by our choice, averaged over layers. Its scale cancels out of
    the projection.
 6. Projection comes before Adam and, by our choice, before clipping, so the final step need not be orthogonal.
 7. The paper fine-tunes on one data set. In a sequence, the pretrained policy remains the anchor.
-8. The one pass over the questions is no optimiser step: no cost on the board counts it.
-9. The energy of which a share is shed is that of the gradient of the backbone's layers, by our choice. Of all
-   trained weights, the share would be smaller.
-10. A batch of the robot is no batch of questions: on FetchKnowledge-v1, its squared distance to the anchor is
-   73 to 119 before the first step, and 2 to 4 after the last step of the first stage. The projection removes
-   only what leads away, so it does not hold the robot's hidden states in place: they move onto those of the
-   questions. With a random direction the distance grows to 168 to 268.
-11. Each variance gets 1e-6 before its root, whose slope is infinite at 0.
+8. The one pass over the questions is not an optimiser step, so no cost on the board counts it.
+9. The share of energy that is shed refers to the gradient of the backbone's layers, by our choice. Relative
+   to the gradient of all trained weights, the share would be smaller.
+10. Batches of robot data are unlike questions: on FetchKnowledge-v1, the squared distance of a batch to the
+   anchor is 73 to 119 before the first step, and 2 to 4 after the last step of the first stage. The
+   projection removes only what leads away from the anchor, so it does not hold the robot's hidden states in
+   place: they move onto the questions' hidden states. With a random direction the distance grows to 168 to
+   268.
+11. 1e-6 is added to each variance before its square root, whose slope is infinite at 0.
 
 `direction="random"` is the control: the same projection against a random direction. (This direction has the
 norm of the anchor's gradient, but the projection does not depend on the norm.)
@@ -62,7 +63,7 @@ class Aegis(Method):
     samples: int = 3000
     """Number of questions for the anchor (the paper's number)."""
     direction: str = "anchor"
-    """Direction of the projection: "anchor", or "random" for the control."""
+    """Direction to project against: "anchor", or "random" for the control."""
 
     uses = Uses(questions="prepare")
     needs = ("hidden_states",)

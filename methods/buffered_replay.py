@@ -1,9 +1,9 @@
 """Buffered replay: experience replay from a buffer of 2 % of the prior demonstrations.
 
-The size of the buffer comes from arXiv 2603.03818. Its authors report that 2 % of the data can be enough for
-no forgetting in vision-language-action models. A note by another reader of the paper gives a negative
+The size of the buffer comes from arXiv 2603.03818. Its authors report that 2 % of the data can be enough to
+prevent forgetting in vision-language-action models. Another reader's note on the paper gives a negative
 backward transfer of 0.1 to 0.2 with 2 % (small networks: 0.4 to 0.5), and nearly none with 20 %. We have read
-its abstract only.
+only its abstract.
 
 Details:
 1. Before the first target, single time steps are drawn at random into the buffer, with replacement; all
@@ -11,10 +11,10 @@ Details:
    seen again. The buffer also holds its share of the last target, whose demonstrations `experience_replay`
    never replays; `bytes kept` counts this share, too.
 2. As in `experience_replay`, half of every batch is replayed by default. Flow time and noise are drawn anew
-   each time. While the buffer is empty, because there is no earlier task, the batch holds the target alone.
-3. Unlike in `experience_replay`, all steps in the buffer are equally likely, so a target with longer
-   demonstrations is replayed more often than another. A step keeps the wording of the instruction with which
-   it was drawn.
+   each time. While the buffer is empty, because there is no earlier task, the batch holds only the target.
+3. Unlike in `experience_replay`, all steps in the buffer are equally likely, so targets with longer
+   demonstrations are replayed more often. A step keeps the wording of the instruction with which it was
+   drawn.
 """
 
 import dataclasses
@@ -77,7 +77,7 @@ class BufferedReplay(Method):
         self.buffer = kept if self.buffer is None else Batch.cat([self.buffer, kept])
 
     def state(self) -> MethodState:
-        """Return the buffer without its draws, which every batch replaces; nothing while it is empty."""
+        """Return the buffer without its draws, which every batch replaces; an empty buffer has no state."""
         columns = {} if self.buffer is None else vars(self.buffer)
         return {name: value for name, value in columns.items() if name not in DRAWN}
 

@@ -40,7 +40,7 @@ class CoTraining(Method):
         return with_questions(target, prior.questions)
 
     def loss(self, policy: Policy, batch: tuple[Batch, QuestionBatch], progress: Progress) -> Tensor:
-        """Return the sum of both losses."""
+        """Return the action loss plus the weighted answer loss."""
         demonstrations, questions = batch
         return (
             policy.action_loss(demonstrations).mean() + self.auxiliary * policy.answer_loss(questions).mean()

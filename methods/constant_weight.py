@@ -1,8 +1,8 @@
 """Constant weight: the loss is scaled by the mean of ConSFT's weights, the same for all samples of a step.
 
-A control. It separates the effect of weighting samples from the effect of small weights: it keeps the mean of
-ConSFT's weights (arXiv 2605.08879), but prefers no sample. Its loss is therefore larger than ConSFT's, whose
-small weights belong to the large losses.
+This control separates the effect of weighting samples from the effect of small weights: it keeps the mean of
+ConSFT's weights (arXiv 2605.08879), but prefers no sample. Its loss is therefore larger than that of ConSFT,
+which gives small weights to large losses.
 
 Details:
 1. The weights are those of `ConSFTCalibrated`, for the losses of the same step. Each sample gets their mean.
@@ -19,9 +19,9 @@ from ._consft_weights import CalibratedSFT
 
 @dataclass
 class ConstantWeight(CalibratedSFT):
-    """Weigh every sample by the mean of ConSFT's weights."""
+    """Weight every sample by the mean of ConSFT's weights."""
 
     def weights(self, losses: Tensor, progress: Progress) -> Tensor:
-        """Return the mean weight for every sample (B,)."""
+        """Return the mean of ConSFT's weights for every sample (B,)."""
         weights = self.confidence(losses, progress)
         return weights.mean().expand_as(weights)

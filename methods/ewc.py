@@ -3,25 +3,27 @@
 Details:
 1. The importance of a weight is its diagonal Fisher information: the mean over samples of the squared
    gradient of the sample's loss. The flow-matching loss replaces the negative log-likelihood, to which it is
-   related, at the demonstrated actions ("empirical Fisher"). Each gradient is of one draw of flow time and
-   noise: the importance also contains the variance between draws.
-2. It is computed for the retained skills before the first target, from prior demonstrations, and for each
-   target after training on it. The sum of these pulls to the weights after the last target ("online" EWC,
-   arXiv 1805.06370, one anchor). All skills together have one importance, the mean over a mixture of their
-   samples, and each target has one of its own: with three skills, a skill counts a third as much as a target.
-   The paper adds one importance for each task. An importance is a mean over 256 samples, and noisy: six
-   estimates for the same policy have a mean correlation of 0.70, and the five largest samples carry 38 to
-   55 % of the sum. Online EWC also multiplies the earlier sum by gamma, and normalises the importance of each
-   task; here gamma is 1, and nothing is normalised.
+   related, at the demonstrated actions ("empirical Fisher"). Each gradient is taken at one draw of flow time
+   and noise, so the importance also contains the variance between draws.
+2. The importance is computed for the retained skills before the first target, from prior demonstrations, and
+   for each target after training on it. The sum of these importances pulls the weights towards their values
+   after the most recent target ("online" EWC, arXiv 1805.06370, with one anchor). All skills together have
+   one importance, the mean over a mixture of their samples, and each target has one of its own: with three
+   skills, a skill counts a third as much as a target. The paper adds one importance for each task. An
+   importance is a mean over 256 samples and noisy: six estimates for the same policy have a mean correlation
+   of 0.70, and the five largest samples carry 38 to 55 % of the sum. Online EWC also multiplies the earlier
+   sum by gamma, and normalises the importance of each task; here gamma is 1, and nothing is normalised.
 3. The penalty is (strength / 2) sum_i F_i (theta_i - theta*_i)^2. Its gradient is added in closed form.
 4. If nothing is retained, no weight is important during the first target.
-5. The gradient of the penalty is clipped together with the loss's, to a norm of 1, and goes through Adam: a
-   strong penalty slows the target down, and `strength` does not mean what it does with plain gradient steps.
-6. The default of `strength` comes from validation episodes of the first Fetch board (docs/history.md). Where
-   methods are tuned, `clbench tune` chose again. Published values are not comparable: the loss is a mean over
-   the numbers of a chunk, 32 on Fetch-v1, so the importance is about 1,000 times smaller than that of a sum.
-7. The passes for the importance, 256 before the first target and after each, are no optimiser steps: no cost
-   on the board counts them.
+5. The gradients of the penalty and of the loss are clipped together, to a norm of 1, and go through Adam. A
+   strong penalty therefore slows down learning of the target, and `strength` does not mean what it does with
+   plain gradient steps.
+6. The default of `strength` was chosen on validation episodes of the first Fetch board (docs/history.md).
+   Where methods are tuned, `clbench tune` chose it again. Published values are not comparable: the loss is a
+   mean over the numbers of a chunk, 32 on Fetch-v1, so the importance is about 1,000 times smaller than with
+   a sum.
+7. The passes that compute the importance, 256 before the first target and 256 after each target, are not
+   optimiser steps, so no cost on the board counts them.
 """
 
 from dataclasses import dataclass
@@ -82,7 +84,7 @@ class EWC(Method):
 
 
 def fisher_information(policy: Policy, source: Source[Batch], samples: int) -> Weights:
-    """Return the mean squared gradient over `samples` losses, for each weight by name; 0 if none."""
+    """Return the mean squared gradient over `samples` losses, for each weight by name; 0 without samples."""
     squares = {name: torch.zeros_like(weight) for name, weight in policy.named_parameters()}
     trained = {name: weight for name, weight in policy.named_parameters() if weight.requires_grad}
     for _ in range(samples):

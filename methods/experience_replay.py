@@ -1,13 +1,13 @@
 """Experience replay: every batch mixes the target with demonstrations of earlier tasks.
 
-Rehearsal as in Rolnick et al. 2019 (arXiv 1811.11682), without their terms that also clone the behaviour;
-arXiv 2603.03818 applies it to vision-language-action models.
+This is rehearsal as in Rolnick et al. 2019 (arXiv 1811.11682), without their additional terms that clone the
+behaviour; arXiv 2603.03818 applies rehearsal to vision-language-action models.
 
 Details:
 1. Prior data are all demonstrations of the retained skills and of the earlier targets. All tasks are equally
    likely.
 2. The batch has the budget's size: replayed samples replace samples of the target.
-3. If there is no earlier task, the batch holds the target alone.
+3. If there is no earlier task, the batch holds only the target.
 """
 
 from dataclasses import dataclass

@@ -2,42 +2,42 @@
 
 This is the method of CapVector (arXiv 2605.10903), which the abstract of "Fast-dVLA" (arXiv 2603.25661)
 describes by mistake: the body of Fast-dVLA accelerates discrete-diffusion policies. The equations are
-CapVector's. Two short fine-tunings on known skills, one with an auxiliary
-objective and one without, give two sets of weights; their difference is the capability vector (Eq. 3). It is
-added to the pretrained weights (Eq. 4). Plain fine-tuning follows, with a penalty on moving the weights where
-the vector is large: lambda sum_i |g_i (theta_i - theta_meta_i)| (Eq. 7 and 8). The aim is to learn a target
-faster, not to forget less.
+CapVector's. Two short fine-tunings on known skills, one with an auxiliary objective and one without, give two
+sets of weights; their difference is the capability vector (Eq. 3). It is added to the pretrained weights
+(Eq. 4). Plain fine-tuning follows, with a penalty on moving the weights where the vector is large:
+lambda sum_i |g_i (theta_i - theta_meta_i)| (Eq. 7 and 8). The aim is to learn a target faster, not to forget
+less.
 
-CapVector's equations, tables and constants are from a note by another reader, and two digests agree with it.
-We have read that paper's abstract only: "the paper" below is the paper as this note describes it. We have
+CapVector's equations, tables and constants come from another reader's note, and two digests agree with it. We
+have read only that paper's abstract: below, "the paper" means the paper as this note describes it. We have
 read the whole paper of Fast-dVLA.
 
 Details:
 1. The auxiliary objective is to answer questions. The paper's Spatial Forcing aligns hidden states with those
-   of a vision model instead: both give the backbone a second task besides acting. But the paper's second task
-   is new to the policy, while questions are a part of the pretraining here. The vector therefore
-   mostly shows the cost of 150 steps without questions:
-   on Fetch-v1, seed 0, the two fine-tunings differ by 0.78 in norm,
-   and move from the pretrained policy by 1.04 in directions with a cosine of 0.73. A scenario whose policy
-   has not been pretrained on questions would test the paper's premise more directly.
+   of a vision model instead. Both objectives give the backbone a second task besides acting, but the paper's
+   second task is new to the policy, while questions are a part of the pretraining here. The vector therefore
+   mostly shows the cost of 150 steps without questions: on Fetch-v1, seed 0, the two fine-tunings differ by
+   0.78 in norm, and both move away from the pretrained policy by 1.04, in directions with a cosine of 0.73. A
+   scenario whose policy has not been pretrained on questions would test the paper's premise more directly.
 2. The paper extracts the vector from a small set of data that the policy has yet to learn. Here the
    extraction set is the demonstrations of all retained skills, which the policy has learned. So it is our
-   choice of data that makes the method read prior demonstrations. The two trainings take 150 steps each; the
-   notes do not give the length of the paper's. Both fine-tunings see the same samples, in the same order with
-   the same draws.
-3. The vector covers all parameters, also those of the answer head, which the auxiliary objective alone
-   trains. The paper drops the module of its objective. None is newly initialised.
+   choice of data that makes the method read prior demonstrations. The two fine-tunings take 150 steps each;
+   the notes do not say how many the paper takes. Both see the same samples, in the same order and with the
+   same draws.
+3. The vector covers all parameters, including those of the answer head, which only the auxiliary objective
+   trains. The paper drops the module of its objective. No parameter is newly initialised.
 4. theta_meta is the merged policy for all targets of the sequence; the paper fine-tunes on one target.
 5. The regulariser's gradient is added in closed form, lambda |g| sign(theta - theta_meta), with sign(0) = 0.
-6. No LoRA: the full matrices are regularised. lambda = 1e-4 was chosen for 7 billion parameters;
-   tuning tried 0.01 and 1 here. At 1e-4, the default and what tuning chose on MetaWorld-v1, the pull is about
-   a ten-thousandth of the loss's gradient: the regulariser is off.
-7. The regulariser's gradient is clipped together with the loss's, to a norm of 1, and goes through Adam.
-8. The vector is cached. The steps that made it count in every row.
-9. Where nothing is retained, there is no skill to make a vector from: the run fails and says so.
-10. Tuning chose only lambda. The auxiliary objective has the factor that pretraining gives questions, 1
-   (Spatial Forcing: 0.5), and alpha is the published 1.1. In the paper, the merge is worth more: 8.0 points
-   of LIBERO's average after 5,000 steps, and the regulariser 1.6 (Table 1).
+6. LoRA is not used: the full matrices are regularised. The paper chose lambda = 1e-4 for 7 billion
+   parameters; here, tuning tried 0.01 and 1. At 1e-4, which is the default and what tuning chose on
+   MetaWorld-v1, the pull is about a ten-thousandth of the loss's gradient: the regulariser is in effect off.
+7. The gradients of the regulariser and of the loss are clipped together, to a norm of 1, and go through Adam.
+8. The vector is cached, but the steps that made it count in every row.
+9. If nothing is retained, there is no skill to make a vector from: the run fails and says so.
+10. Of the method's own settings, tuning chose only lambda. The auxiliary objective has the factor that
+   pretraining gives questions, 1 (Spatial Forcing: 0.5), and alpha is the published 1.1. In the paper, the
+   merge is worth more than the regulariser: 8.0 points of LIBERO's average after 5,000 steps, against 1.6
+   (Table 1).
 
 `direction="random"` is the control: a random vector with the capability vector's norm in each matrix.
 """
@@ -81,7 +81,7 @@ class FastDVLA(Method):
     steps: int = 150
     """Optimiser steps of each of the two fine-tunings."""
     step_size: float = 3e-4
-    """Peak learning rate of these fine-tunings: that of most scenarios, whatever `step_factor` is."""
+    """Peak learning rate of these fine-tunings, as in most scenarios; `step_factor` does not change it."""
     direction: str = "capability"
     """Vector to merge: "capability", or "random" for the control."""
 

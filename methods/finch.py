@@ -1,15 +1,16 @@
 """FINCH: the learning rate follows the loss (arXiv 2605.20005), an alternative to weighting samples.
 
-A step can raise the loss on earlier tasks by a bounded amount, which grows with the root of the present loss.
-The learning rate is therefore kappa / sqrt(EMA(L) + eps), capped: steps are small while the loss is high, at
-the start of a target. The formula is from a note by another reader; we have not read the paper.
+A step can raise the loss on earlier tasks by a bounded amount, and this bound grows with the square root of
+the current loss. The learning rate is therefore kappa / sqrt(EMA(L) + eps), capped: steps are small while the
+loss is high, at the start of a target. The formula comes from another reader's note; we have not read the
+paper.
 
 Details:
 1. The cap is the benchmark's own schedule instead of the paper's constant 5e-5, so that FINCH takes no larger
    steps than plain fine-tuning. kappa is therefore a factor of that schedule.
-2. The default of kappa comes from validation episodes of the first Fetch board (docs/history.md).
-   Where methods are tuned, `clbench tune` chose again.
-3. The average restarts with the first loss of each target. The eps is 1e-8.
+2. The default of kappa was chosen on validation episodes of the first Fetch board (docs/history.md). Where
+   methods are tuned, `clbench tune` chose it again.
+3. The average restarts with the first loss of each target, and eps is 1e-8.
 """
 
 import math
@@ -30,7 +31,7 @@ class Finch(Method):
     """Take smaller steps while the loss is high."""
 
     kappa: float = 0.3
-    """Root of the average loss at and below which steps have the scheduled size."""
+    """Steps have the scheduled size while the square root of the average loss is at most this value."""
     momentum: float = 0.9
     """Momentum of the exponential moving average of the loss (the paper's value)."""
 

@@ -1,10 +1,11 @@
 """From scratch: a new policy without pretraining for each target.
 
-A reference row: forward transfer (Continual World, arXiv 2105.10919) compares the learning curves of a method
-with those of this row. The policy keeps the normalisation of the pretrained policy, so that both read the
-same numbers. It is not tuned: the committed rows have the scenario's learning rate. This is a fifth of
-pretraining's, except on MetaWorldCW-v0, where it is a third larger. Where it is a fifth, larger steps would
-learn faster, so the speed of other methods, which is relative to this one, looks better than it is.
+This is a reference row: forward transfer (Continual World, arXiv 2105.10919) compares the learning curves of
+a method with those of this row. The policy keeps the normalisation of the pretrained policy, so that both
+read the same numbers. It is not tuned: the committed rows use the scenario's learning rate. This rate is a
+fifth of the rate of pretraining, except on MetaWorldCW-v0, where it is a third larger. Where it is a fifth,
+larger steps would learn faster. The speed of other methods is relative to this row, so it looks better there
+than it is.
 """
 
 from collections.abc import Iterable

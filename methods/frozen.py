@@ -1,4 +1,4 @@
-"""Frozen: the pretrained policy, without training. A reference row: it learns and forgets nothing."""
+"""Frozen: the pretrained policy, without training. This reference row learns nothing and forgets nothing."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

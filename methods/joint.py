@@ -1,9 +1,10 @@
 """Joint: training on the demonstrations of all skills and targets so far, and on the questions.
 
-A reference row: it keeps these demonstrations, so it does not solve forgetting. Like every other method, it
-never sees those of the background, the tasks of pretraining that no score counts. It is no upper bound: it is
-not tuned, and where stages end at a criterion, they end after few steps. Replay ends above it there, and on
-FetchPixels-v0 as well. Its success right after a target is a* in intransigence (Chaudhry 2018).
+This is a reference row: it keeps these demonstrations, so it does not solve forgetting. Like every other
+method, it never sees demonstrations of the background, the tasks of pretraining that no score counts. It is
+not an upper bound: it is not tuned, and where stages end at a criterion, they end after few steps. Replay
+scores higher there, and also on FetchPixels-v0. The success of `joint` right after a target is a* in
+intransigence (Chaudhry 2018).
 
 Details:
 1. A step reads a batch of the target, as many prior samples if there are any, and half as many questions: 2.5

@@ -1,14 +1,15 @@
 """Knowledge insulation: the backbone trains on questions, not on the head's gradient (arXiv 2505.23705).
 
 Details:
-1. The backbone trains on questions alone. In the paper it also learns to predict discrete action tokens
-   (FAST), which this policy does not have: here the backbone learns nothing about the new task.
+1. The backbone trains only on questions. In the paper it also learns to predict discrete action tokens
+   (FAST), which this policy does not have, so here the backbone learns nothing about the new task.
 2. Each batch of demonstrations comes with half as many questions, as in pretraining.
 3. The paper stops the gradient at the backbone's keys and values, which its action expert reads. Here the
    head reads the backbone's hidden states, detached, with key and value maps of its own.
-4. alpha = 1 weights the action loss. This factor does nearly nothing here: the action loss trains the head
-   alone and the answer loss the backbone alone, and Adam cancels a constant factor. A factor of 0.3 or 3
-   changes a step by 2 to 3 %, through the clipping that both share. So tuning tries learning rates instead.
+4. The factor alpha = 1 weights the action loss. It has almost no effect here: the action loss trains only the
+   head, the answer loss trains only the backbone, and Adam cancels a constant factor. A factor of 0.3 or 3
+   changes a step by 2 to 3 %, through the clipping that both losses share. Tuning therefore tries learning
+   rates instead.
 """
 
 from dataclasses import dataclass

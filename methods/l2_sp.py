@@ -4,10 +4,11 @@ Details:
 1. The penalty (strength / 2) ||theta - theta*||^2 applies to all weights, because no layer is new here. Its
    gradient is added in closed form.
 2. theta* is the pretrained policy during the whole sequence.
-3. The gradient of the penalty is clipped together with the loss's, to a norm of 1, and goes through Adam: a
-   strong penalty slows the target down, and `strength` does not mean what it does with plain gradient steps.
-4. The default of `strength` comes from validation episodes of the first Fetch board (docs/history.md). Where
-   methods are tuned, `clbench tune` chose again.
+3. The gradients of the penalty and of the loss are clipped together, to a norm of 1, and go through Adam. A
+   strong penalty therefore slows down learning of the target, and `strength` does not mean what it does with
+   plain gradient steps.
+4. The default of `strength` was chosen on validation episodes of the first Fetch board (docs/history.md).
+   Where methods are tuned, `clbench tune` chose it again.
 """
 
 from dataclasses import dataclass

@@ -1,17 +1,18 @@
-"""LoRA: only low-rank additions to the linear layers are trained (arXiv 2106.09685), with the library peft.
+"""LoRA: only low-rank additions to the linear layers are trained (arXiv 2106.09685), using the library peft.
 
 Details:
 1. Every linear map inside the layers of the backbone and of the action head has an adapter: queries, keys and
-   values, outputs and feed-forward. One map gives keys and values: they share its adapter and its rank. Rank
-   16 and alpha 32 come from AEGIS's baseline (arXiv 2604.16067), which adapts the layers of the language
-   model; here the action head is low-rank as well, and what lies outside of its layers (embedding, time,
-   position, output) stays as it is.
-2. One adapter is trained on all targets in turn, as in arXiv 2603.11653; the weights below it never change.
+   values, outputs and feed-forward. Keys and values come from one map, so they share its adapter and its
+   rank. Rank 16 and alpha 32 come from AEGIS's baseline (arXiv 2604.16067), which adapts the layers of the
+   language model. Here the layers of the action head are adapted as well, and everything outside the layers
+   (embedding, time, position, output) stays as it is.
+2. One adapter is trained on all targets in turn, as in arXiv 2603.11653; the weights that it adapts never
+   change.
 3. `variant` is "lora", "dora" (arXiv 2402.09353) or "rslora" (arXiv 2312.03732).
-4. Adapters start from zero and must move further than full weights: `speed` multiplies the learning rate,
-   which at a step factor of 1 is three times that of the other methods. It was chosen on validation episodes
-   of the first Fetch board (docs/history.md). Where methods are tuned, `clbench tune` chose the learning rate
-   and the rank.
+4. Adapters start from zero and must move further than full weights. `speed` therefore multiplies the learning
+   rate: at a step factor of 1, it is three times that of the other methods. `speed` was chosen on validation
+   episodes of the first Fetch board (docs/history.md). Where methods are tuned, `clbench tune` chose the
+   learning rate and the rank.
 5. `alpha` stays 32 when the rank is tuned, so that rank 4 has four times the scale of rank 16: the two are
    tuned together.
 """
@@ -29,7 +30,7 @@ from clbench.policy.policy import Policy
 from ._requirements import in_range, one_of
 
 PAST_ADAPTERS = (nn.MultiheadAttention, nn.TransformerEncoderLayer)
-"""Modules of PyTorch whose fast paths hand the weights of their linear maps to one fused function."""
+"""PyTorch modules whose fast paths pass the weights of their linear maps to one fused function."""
 VARIANTS = ("lora", "dora", "rslora")
 
 
@@ -97,7 +98,7 @@ class LoRA(Method):
         return self.speed * scheduled
 
     def state(self) -> MethodState:
-        """Return a mark for the adapters; their weights belong to the policy."""
+        """Return a mark that the adapters exist; their weights belong to the policy."""
         return {"adapted": True}
 
     def load_state(self, policy: Policy, state: MethodState) -> None:

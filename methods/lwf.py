@@ -11,7 +11,7 @@ Details:
    pretrained model, which is the same thing for the first target.
 4. A head that fills in masked tokens distils its expected actions, not their distribution.
 5. The distillation takes two more forward passes, one of the policy and one of its frozen copy. Both count
-   in the time of a step.
+   towards the time of a step.
 6. `strength` was chosen on validation episodes of the first Fetch board (docs/history.md).
 """
 

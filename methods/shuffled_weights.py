@@ -1,7 +1,7 @@
 """Shuffled weights: ConSFT's weights, assigned to the samples of the batch at random.
 
-A control. It separates the choice of which samples get a small weight from the fact that some do: it keeps
-ConSFT's (arXiv 2605.08879) distribution of weights, but a weight no longer depends on its own sample. As with
+This control keeps ConSFT's (arXiv 2605.08879) distribution of weights, but a weight no longer depends on its
+own sample. It shows whether it matters which samples get a small weight, or only that some do. As with
 `constant_weight`, the loss is on average larger than ConSFT's.
 
 Details:
@@ -20,7 +20,7 @@ from ._consft_weights import CalibratedSFT
 
 @dataclass
 class ShuffledWeights(CalibratedSFT):
-    """Give the samples of a batch each other's weights, in a random order."""
+    """Weight the samples of a batch by ConSFT's weights, in a random order."""
 
     def weights(self, losses: Tensor, progress: Progress) -> Tensor:
         """Return ConSFT's weights (B,) in a random order."""

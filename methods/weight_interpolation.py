@@ -1,15 +1,16 @@
 """Weight interpolation: after each target, the weights move part of the way back.
 
-WiSE-FT (arXiv 2109.01903) for fine-tuned models, RETAIN (arXiv 2512.08333) for vision-language-action models:
+WiSE-FT (arXiv 2109.01903) does this for fine-tuned models, and RETAIN (arXiv 2512.08333) for
+vision-language-action models:
 theta = (1 - coefficient) theta_before + coefficient theta_after.
 
 Details:
 1. theta_before is the policy at the start of the target, so that the merge protects earlier targets as well
    as skills.
-2. One coefficient for all weights. It was chosen on validation episodes of the first Fetch board
+2. All weights share one coefficient. It was chosen on validation episodes of the first Fetch board
    (docs/history.md).
-3. The method's policy exists only after the merge: it is evaluated there alone, and has no learning curve.
-   Where a criterion ends the stage, each check plays the merged policy, and the stage goes on with the
+3. The method's policy exists only after the merge, so it is evaluated only there, and has no learning curve.
+   Where a criterion ends the stage, each check plays the merged policy, and training continues with the
    weights before the merge.
 """
 

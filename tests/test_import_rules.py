@@ -1,7 +1,7 @@
 """Import rules: which package may import which, and how large a module and a package may be.
 
 The imports are read from the source, at the top of modules and inside functions. Imports below
-`if TYPE_CHECKING` serve type checkers alone and do not count. A name in a string, such as the entry point of
+`if TYPE_CHECKING` serve only type checkers and do not count. A name in a string, such as the entry point of
 a world, is not an import: the core finds its parts by such names.
 """
 

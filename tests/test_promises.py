@@ -1,4 +1,4 @@
-"""What releases promise, in the page of versions: a change of a promise is seen before it is made."""
+"""What releases promise, on the page of versions: a change of a promise is seen before it is made."""
 
 from pathlib import Path
 

@@ -17,13 +17,13 @@ from rich.progress import TimeRemainingColumn as TimeLeftColumn
 from clbench.base.text import clock_time, print_plain, printable, printable_lines
 
 LINE_SECONDS = 30.0
-"""Seconds between two lines without a terminal."""
+"""Seconds between two printed lines when there is no terminal."""
 
 KNOWN = 0.01
-"""Share of all work from which the time left is shown: 30 s into hours of work, it showed two weeks."""
+"""Share of all work to do before the time left is shown: 30 s into hours of work, it said two weeks."""
 
 AT_ONCE = 1.0
-"""A piece that ends within so many seconds was done before: its result is cached, for example."""
+"""A piece that ends within this many seconds was done before: for example, its result is cached."""
 
 
 @dataclass
@@ -127,12 +127,12 @@ class Bars:
     def finish(self, piece: Hashable, text: str) -> None:
         """Complete and remove the bar of a piece, and print the outcome.
 
-        What took no time does not count: it says nothing of how long the rest will take.
+        A piece that took no time does not count: it says nothing about how long the rest will take.
         """
         shown = self._pieces[piece]
         if self._clock() - shown.begun < AT_ONCE:
             self._total = max(self._total - shown.left, self._done, 1e-9)
-            # a bar of which nothing is left to do is full
+            # a bar with nothing left to do is full
             self._progress.update(self._all, total=self._total, completed=min(self._done + 1e-9, self._total))
         else:
             self.advance(piece, shown.left)
@@ -146,5 +146,5 @@ class Bars:
 
 
 def lines_console() -> Console:
-    """Return a console for standard error; in a notebook its lines are text, and no pieces of HTML."""
+    """Return a console for standard error; in a notebook, its lines are text rather than HTML."""
     return Console(stderr=True, force_jupyter=False)

@@ -1,4 +1,4 @@
-"""The folders that work reads and writes, and a check that they can be written to before it begins."""
+"""The folders that work reads and writes, and a test before work begins that they can be written to."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from clbench.base.errors import InputError
 from clbench.base.leftovers import unfinished
 
 PLACES = ("CLBENCH_CACHE", "XDG_CACHE_HOME", "MINARI_DATASETS_PATH")
-"""Variables that name folders of data."""
+"""Environment variables that name data folders."""
 
 
 def minari_folder() -> Path:
@@ -20,20 +20,20 @@ def minari_folder() -> Path:
 
 
 def absolute_places() -> dict[str, str]:
-    """Return the variables that name folders of data, absolute: a job may change its working directory."""
+    """Return the variables that name data folders, made absolute: a job may change its working directory."""
     return {
         name: str(Path(os.environ[name]).expanduser().absolute()) for name in PLACES if os.environ.get(name)
     }
 
 
 def check_folders(folders: Mapping[str, Path | None]) -> None:
-    """Refuse folders that cannot be made or written to, and the cache's; nothing is left behind.
+    """Refuse folders, caches included, that cannot be made or written to, and leave nothing behind.
 
     Args:
         folders: Folders by the name of their option.
 
     Raises:
-        InputError: A part of a path is no folder, or no file can be written there.
+        InputError: A part of a path is not a folder, or no file can be written there.
     """
     data = {"CLBENCH_CACHE": cache_folder(), "MINARI_DATASETS_PATH": minari_folder()}
     for name, folder in {**folders, **data}.items():

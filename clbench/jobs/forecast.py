@@ -38,7 +38,7 @@ KINDS = {
     work.do_run: ("run", "runs"),
     work.make_policies: ("run to train again for its policies", "runs to train again for their policies"),
 }
-"""What one job does, and what several do, in words. A plan does not know which data are in the cache."""
+"""Words for one job of a kind, and for several jobs. A plan does not know which data are in the cache."""
 
 
 def forecast(plan: Plan, runs: Sequence[ResolvedRun], workers: int, checkpoints: Path | None) -> list[str]:
@@ -47,7 +47,7 @@ def forecast(plan: Plan, runs: Sequence[ResolvedRun], workers: int, checkpoints:
     Args:
         plan: The plan of the runs.
         runs: The runs, of one scenario or of several.
-        workers: Number of jobs at once.
+        workers: Number of jobs that run at once.
         checkpoints: Folder that would keep the policies of all stages, or None.
     """
     counts = Counter(KINDS[job.function] for job in plan.jobs)
@@ -95,7 +95,7 @@ def _disk(
     made = sum(map(_data_bytes, scenarios.values()))
     made += sum(policies[job.arguments["scenario"]] for job in jobs if job.function is work.pretrain)
     records = RECORD_BYTES * sum(job.function is work.do_run for job in jobs)
-    # a checkpoint is written before the one of the stage before goes, and a method's state is not in it
+    # the next checkpoint is written before the last one is removed; a method's state is not counted
     meanwhile = 2 * min(at_once, len(runs)) * max(policies.values())
     parts = [
         f"about {_megabytes(made)} in the caches",
@@ -143,7 +143,7 @@ def _policy_bytes(scenario: Scenario) -> int:
 
 
 def _data_bytes(scenario: Scenario) -> int:
-    """Return the most bytes that the demonstrations of a scenario take: episodes as long as they may be."""
+    """Return the most bytes that the demonstrations of a scenario can take, with episodes of full length."""
     config = policy_config(scenario)
     numbers = 4 * (config.state_size + 3 * config.action_size + 4)
     tasks = scenario.tasks + scenario.background

@@ -1,4 +1,4 @@
-"""Runs of methods on scenarios for several seeds: which of them are missing, and doing these."""
+"""Runs of methods on scenarios for several seeds: find out which runs are missing, and do them."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ class RunsFailedError(ClbenchError, RuntimeError):
 
 
 class Missing(NamedTuple):
-    """What is still missing of a grid."""
+    """What is still missing from a grid."""
 
     runs: list[ResolvedRun]
     """Runs without a record."""
     stages: list[ResolvedRun]
-    """Runs with a record whose policies are to be kept, and are not."""
+    """Runs with a record whose policies should be kept but are not."""
 
     def plan(
         self,
@@ -68,7 +68,7 @@ class Missing(NamedTuple):
 
 
 def missing(runs: Sequence[ResolvedRun], records: Path, checkpoints: Path | None) -> Missing:
-    """Return what has to be done until all runs have a record and, with `checkpoints`, policies there."""
+    """Return what is left to do until all runs have a record and, with `checkpoints`, kept policies."""
     from clbench.runs.stages import has_stages
 
     without, stages = [], []
@@ -89,7 +89,7 @@ def run_missing(
     tensorboard: Path | None = None,
     check: Job | None = None,
 ) -> dict[Job, str]:
-    """Do the runs that have no record yet, and return the reason of each failure by job.
+    """Do the runs that have no record yet, and return the reason for each failure by job.
 
     Args:
         runs: The runs.
@@ -101,8 +101,8 @@ def run_missing(
         check: Job that must succeed before anything else is done; its limits hold for the runs, too.
 
     Raises:
-        InputError: A record is of another definition of its scenario, or this machine cannot render what a
-            scenario needs.
+        InputError: A record was made with another definition of its scenario, or this machine cannot render
+            what a scenario needs.
     """
     from clbench.jobs.work import do_run, make_policies
 
@@ -156,7 +156,7 @@ def _part(lost: int, count: int) -> str:
 
 
 def _without_record(jobs: Sequence[Job], failed: Mapping[Job, str], records: Path) -> dict[Job, str]:
-    """Return the reason of each run that reported success and has no record that counts."""
+    """Return the jobs that reported success but left no record that counts, each with the reason."""
     lost = {}
     for job in jobs:
         if job.product is None or job in failed or job.product.exists():
@@ -187,11 +187,11 @@ def run(
     """Run a method on a scenario, once per seed, and return the records by seed.
 
     Missing inputs are made first, as `clbench run` does. A run that has a record in the folder is not done
-    again, unless the code of a method of your own has changed: the old record is then set aside. Progress
-    shows on standard error, in notebooks below the cell.
+    again, unless the code of a method of your own has changed: the old record is then set aside. Progress is
+    shown on standard error; in notebooks, below the cell.
 
-    A class from a notebook, or from the script itself, cannot be imported by other processes: its runs are
-    done here, one after the other. Put it into a module to use all cores.
+    Other processes cannot import a class from a notebook, or from the script itself: its runs are done in
+    this process, one after the other. Put the class into a module to use all cores.
 
     Args:
         scenario: Gymnasium id of the scenario; "module:id" imports the module first.
@@ -218,7 +218,7 @@ def run(
 
 
 def run_specs(firsts: Sequence[RunSpec], seeds: int, records: Path, workers: int | None) -> list[Record]:
-    """Do the runs that `firsts` name, each with several seeds from its own on, and return their records.
+    """Do the runs in `firsts`, each for `seeds` seeds from its own seed on, and return their records.
 
     Raises:
         UnknownNameError: There is no such scenario, method or hyper-parameter.
@@ -263,7 +263,8 @@ def name_of(method: str | type[Method]) -> str:
     """Return the name of a method: the installed one, or "module:Class".
 
     Raises:
-        WrongTypeError: It is no class, or one inside a function or another class, where no name can reach it.
+        WrongTypeError: The method is not a class, or it is a class inside a function or another class, where
+            no name can reach it.
     """
     if isinstance(method, str):
         return method

@@ -40,7 +40,7 @@ class Job:
     arguments: dict[str, Any]
     """Arguments by name; they travel to another process."""
     length: float
-    """Length in optimiser steps: what `progress` is told adds up to it."""
+    """Length in optimiser steps: the amounts that `progress` gets add up to it."""
     needs: tuple[Job, ...] = ()
     """Jobs that must succeed first."""
     limits: Limits | None = None
@@ -63,8 +63,8 @@ class Job:
     def bare(self) -> Job:
         """Return the job with only what a worker needs.
 
-        The command has the lease, and looks for the product. The functions that look know the whole run: they
-        would travel with it, and make the worker import its method before it begins.
+        The command holds the lease, and looks for the product. The functions that look for it know the whole
+        run: they would travel with it, and make the worker import the method before the job begins.
         """
         return replace(self, needs=(), product=None)
 
@@ -92,7 +92,7 @@ def chain_times(
 
 
 Outcome = Literal["done", "failed", "taken"]
-"""How a job ended, as it reported; a job is taken if another process took its work over."""
+"""How a job ended, as it reported; a job is taken if another process took over its work."""
 
 
 class Event(NamedTuple):

@@ -33,7 +33,7 @@ stages such a run takes 170 s, and plain fine-tuning, which forgets, takes 232 s
 
 EARLY_PACE, EARLY_REPLAY_PACE = 0.2, 0.35
 """Pace of runs whose stages end when the target is learned: their length counts the steps of whole stages.
-The 44 runs of Fetch-v1 took 15 ms for a unit of length, those with replay 29 ms; a step of pretraining took
+The 44 runs of Fetch-v1 took 15 ms per unit of length, and 29 ms with replay; a step of pretraining took
 90 ms."""
 
 
@@ -115,7 +115,7 @@ class Plan:
 
         Args:
             run: The run.
-            checkpoints: Folder below which the policies are kept; None leaves them in the cache alone.
+            checkpoints: Folder below which the policies are kept; None leaves them only in the cache.
             limits: Limits of the process of the job; None sets none.
         """
         arguments = {"spec": run.spec, "checkpoints": checkpoints and checkpoints.absolute()}
@@ -152,9 +152,9 @@ class Plan:
         return job
 
     def add_pretraining_data(self, name: str, scenario: Scenario) -> tuple[Job, ...]:
-        """Add jobs that collect all that a policy is pretrained on, and return them.
+        """Add jobs that collect everything that a policy is pretrained on, and return them.
 
-        Nobody pretrains a class of policies with weights of its own, so it needs no demonstrations.
+        A policy class with weights of its own is not pretrained, so it needs no demonstrations.
 
         Args:
             name: Id of the scenario, as the user typed it.
@@ -247,7 +247,7 @@ def _check_recording(task: Task, budget: Budget) -> None:
     """Refuse a task whose recorded demonstrations are not on this machine, before a policy is pretrained.
 
     Raises:
-        InputError: They are missing: nothing but their file can bring them.
+        InputError: They are missing, and only their file can provide them.
     """
     from minari.storage.datasets_root_dir import get_dataset_path
 
@@ -298,7 +298,7 @@ def _pace(run: ResolvedRun) -> float:
 
 
 def _title(scenario: str, text: str, policy: str = DEFAULT_POLICY) -> str:
-    """Return the title of a job of a scenario and a policy; no other job of a plan has it."""
+    """Return the title of a job for a scenario and a policy, which is unique within a plan."""
     return f"{folder_name(table_name(without_module(scenario), policy))} {text}"
 
 

@@ -1,4 +1,4 @@
-"""Compare the memory and the writes of a process with its limits, and kill it with all that it started."""
+"""Compare the memory and writes of a process with its limits, and kill it with everything it started."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ def end(process: int) -> None:
 
 
 def end_group(leader: int) -> None:
-    """Kill what is left of the group of a process that leads one: children outlive their parent."""
+    """Kill what is left of the process group that `leader` leads: children may outlive their parent."""
     if hasattr(os, "killpg"):
         signal_group(leader, signal.SIGKILL)
 
 
 def signal_group(leader: int, number: signal.Signals) -> None:
-    """Send a signal to the group of a process that leads one, if there is such a group."""
+    """Send a signal to the process group that `leader` leads, if there is one."""
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(leader, number)

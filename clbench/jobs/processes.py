@@ -28,7 +28,7 @@ from clbench.jobs.process_limits import end, end_group, exceeded, signal_group
 from clbench.worlds.threads import cores
 
 SEND_SECONDS = 0.2
-"""Least time between two progress reports of a worker, in seconds."""
+"""Shortest time between two progress reports of a worker, in seconds."""
 
 LEAVE_SECONDS = 5.0
 """Time for a process that has sent its outcome to end, in seconds; then it is killed."""
@@ -38,7 +38,7 @@ _LOOK_SECONDS = 0.5
 
 
 def at_once(device: str) -> int:
-    """Return how many jobs run at once on a device, unless the user says: one per core, or one per GPU."""
+    """Return how many jobs run at once on a device by default: one per core, or one per GPU."""
     return cores() if device == "cpu" else max(1, len(_gpus())) if device == "cuda" else 1
 
 
@@ -63,7 +63,7 @@ class _Worker:
     broken: str | None = None
     """Limit that its process exceeded, in words; None if it exceeded none."""
     place: str | None = None
-    """Hook of a method that it announced last."""
+    """Last hook of a method that it announced."""
 
 
 class Processes:
@@ -86,7 +86,7 @@ class Processes:
         return self._count - len(self._running)
 
     def start(self, job: Job) -> None:
-        """Start a job in its own process, and on a GPU of its own as far as there are enough."""
+        """Start a job in its own process, and on its own GPU if there are enough GPUs."""
         used = [worker.gpu for worker in self._running.values()]
         gpu = min(_gpus(), key=used.count, default=None) if job.device == "cuda" else None
         with _signals_held_back():
@@ -116,7 +116,7 @@ class Processes:
             yield event
 
     def close(self) -> None:
-        """End all processes and what they started, also those that ignore SIGTERM."""
+        """End all processes and what they started, even if they ignore SIGTERM."""
         processes = [worker.process for worker in self._running.values()]
         try:
             for process in processes:
@@ -132,7 +132,7 @@ class Processes:
                 signal.signal(signal.SIGTSTP, signal.SIG_DFL)
 
     def _suspend(self, *_: object) -> None:
-        """Stop with all workers on Ctrl-Z, and go on with them: a terminal does not reach their groups."""
+        """On Ctrl-Z, stop and later continue with all workers: a terminal does not reach their groups."""
         groups = [worker.process.pid for worker in self._running.values() if worker.process.pid]
         for group in groups:
             signal_group(group, signal.SIGSTOP)
@@ -167,7 +167,7 @@ class Here:
         return 0 if self._job else 1
 
     def start(self, job: Job) -> None:
-        """Start a job in a thread, so that this one can show its progress."""
+        """Start a job in a new thread, so that this thread can show its progress."""
         self._job = job
         self._thread = threading.Thread(target=self._work, args=(job,), daemon=True)
         self._thread.start()
@@ -215,13 +215,13 @@ def _handles_suspension() -> bool:
 
 
 def _leave(process: BaseProcess) -> None:
-    """Wait until a process that has sent its outcome is gone, and kill what still runs of all it began."""
+    """Wait for a process that has sent its outcome to end, and kill everything it started that still runs."""
     process.join(LEAVE_SECONDS)
     _end(process)
 
 
 def _end(process: BaseProcess) -> None:
-    """Kill a process, if it still runs, and all that it started."""
+    """Kill a process, if it still runs, and everything that it started."""
     assert process.pid is not None
     if process.is_alive():
         end(process.pid)
@@ -266,7 +266,7 @@ def _context() -> Any:
     context = multiprocessing.get_context("forkserver")
     # the second module also takes a second, and PyTorch's deterministic algorithms import it
     context.set_forkserver_preload(["clbench.runs.run", "torch._inductor.config"])
-    # else the server starts it, and unblocks Ctrl-C for itself on the way
+    # otherwise the server starts it, and thereby unblocks Ctrl-C for itself
     resource_tracker.ensure_running()
     # The server inherits the mask. It ignores Ctrl-C, which reaches all processes of a terminal, only after
     # its imports: until then the mask protects it. A Ctrl-C that comes meanwhile waits here, and is not lost.
@@ -331,7 +331,7 @@ def _work(
     # this process may be forked from one with an older environment
     os.environ.clear()
     os.environ.update(environment)
-    multiprocessing.current_process().daemon = False  # else a method could not have processes of its own
+    multiprocessing.current_process().daemon = False  # otherwise a method could not start processes
     if hasattr(os, "setpgid"):
         os.setpgid(0, 0)  # so that the parent can end them with this process
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers when Ctrl-C reaches it

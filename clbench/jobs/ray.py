@@ -39,7 +39,7 @@ _INSTRUCTIONS = (
 """Variables that select the instructions of the processor, and so affect the bits of trained weights."""
 _PASSED_ON = ("MUJOCO_GL", *_INSTRUCTIONS)
 _PATIENCE = 10.0
-"""Seconds in which the machine of a cluster must accept a connection."""
+"""Seconds within which the machine of a cluster must accept a connection."""
 
 
 class LostProcessError(Exception):
@@ -74,7 +74,7 @@ class RayWorkers:
         self._count = count
         options: dict[str, Any] = {"runtime_env": {"env_vars": _environment()}}
         if address == "local":
-            # otherwise the workers yield to all other work on this machine, by a niceness of 15
+            # otherwise the workers, at a niceness of 15, yield to all other work on this machine
             options |= {
                 "_system_config": {"worker_niceness": 0},
                 "num_cpus": count,
@@ -118,7 +118,7 @@ class RayWorkers:
             yield Event(job, *self._end(job, reference))
 
     def _amounts(self) -> dict[str, float]:
-        """Return the progress of each job, nothing if what keeps it is lost: the jobs go on without bars."""
+        """Return the progress of each job; empty if its actor is lost, and the jobs go on without bars."""
         try:
             found: dict[str, float] = self._ray.get(self._progress_actor.amounts.remote())
         except self._ray.exceptions.RayError:
@@ -197,7 +197,7 @@ class _ProgressActor:
 
 
 def _do(actor: Any, job: Job) -> _Result:
-    """Do a job on a node of the cluster, and return its records: the node may not see their folder."""
+    """Do a job on a node of the cluster, and return its records: the node may lack access to their folder."""
     actor.begin.remote(job.title)
     if "records" not in job.arguments:
         return _Result(*_do_apart(actor, job), {})

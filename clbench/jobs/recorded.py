@@ -44,9 +44,9 @@ def has_record(run: ResolvedRun, records: Path) -> bool:
 
 
 def has_settings_of(record: Record, run: ResolvedRun) -> bool:
-    """Return whether a record has the settings, the budget and the device of a run; it may be perturbed.
+    """Return whether a record has a run's settings, budget and device; the record may also be perturbed.
 
-    The board's rule holds: a setting that an older record lacks was added later, with a default that changes
+    As on the board, a setting that an older record lacks was added later, with a default that changes
     nothing.
     """
     settings = {**run.defaults, **record.run.settings}
@@ -65,7 +65,7 @@ def has_failed(run: ResolvedRun, records: Path) -> bool:
 
 
 def set_aside(run: ResolvedRun, records: Path) -> str | None:
-    """Rename the record of a run if it is damaged, or of older code or weights, to do the run again.
+    """Rename the record of a run if it is damaged, or from older code or weights, to repeat the run.
 
     Returns:
         A sentence that says what was wrong and where the record is now; None if there is no such record.
@@ -98,7 +98,8 @@ def set_aside(run: ResolvedRun, records: Path) -> str | None:
 def changed_code(record: Record, run: ResolvedRun) -> list[str]:
     """Return in words what has changed since a record: code of its method, or code or weights of its policy.
 
-    The version of a method with a name of its own says whether it is; a "module:Class" is work in progress.
+    A method with a name of its own changes when its version does. A "module:Class" is work in progress: it
+    changes with its source.
     """
     from clbench.learning.registry import describe_method
     from clbench.runs.fingerprint import describe_policy
@@ -121,7 +122,7 @@ def changed_code(record: Record, run: ResolvedRun) -> list[str]:
 
 
 def _check_definition(record: Record, published: Scenario, path: Path) -> None:
-    """Refuse a record of another definition of its scenario."""
+    """Refuse a record that was made with another definition of its scenario."""
     from clbench.evaluation.definition import definition
 
     recorded = record.fingerprint.get("definition")

@@ -21,7 +21,7 @@ WAIT_SECONDS = 1.0
 
 
 def run_jobs(jobs: Sequence[Job], workers: Workers, bars: Bars) -> dict[Job, str]:
-    """Do all jobs, and return the reason of each failure by job.
+    """Do all jobs, and return the reason for each failure by job.
 
     A job that fails, or whose process dies, does not stop the others; jobs that need it are left out. A job
     that another command is doing waits until that command has done it or has died. This function leaves no
@@ -84,7 +84,7 @@ def run_jobs(jobs: Sequence[Job], workers: Workers, bars: Bars) -> dict[Job, str
 
 
 def _ending(job: Job) -> str | None:
-    """Return how a job ended elsewhere, or why that cannot be told; None if it is to be done."""
+    """Return how a job ended elsewhere, or why that is not known; None if the job is still to be done."""
     if job.product is None:
         return None
     try:
@@ -104,14 +104,14 @@ class _Leases:
         self._told = set[bool]()
 
     def take(self, ready: Iterable[Job], most: int) -> dict[Job, str | None]:
-        """Take the leases of as many of the jobs as can be had, in their order, and return these jobs.
+        """Take the leases of as many jobs as possible, in their order, and return these jobs.
 
         A lease that another command had within `WAIT_SECONDS` is not tried: a file server answers each try.
-        Each job comes with the fault of the file system that refused its lease, or None.
+        Each job comes with the error of the file system that refused its lease, or None.
         """
         taken: dict[Job, str | None] = {}
         for job in ready:
-            if len(taken) >= most:  # a cluster that shrinks has fewer than none
+            if len(taken) >= most:  # on a shrinking cluster, fewer than none are free
                 break
             now = time.monotonic()
             if job in self._all and now - self._tried.get(job, -math.inf) < WAIT_SECONDS:
@@ -125,7 +125,7 @@ class _Leases:
         return taken
 
     def wait(self, waiting: Sequence[Job], has_worker: bool, bars: Bars) -> None:
-        """Wait a moment, as other commands do what is left or no worker is free; say so the first time."""
+        """Wait a moment, because other commands do the rest or no worker is free; say so the first time."""
         if has_worker not in self._told:
             self._told.add(has_worker)
             left = "job" if len(waiting) == 1 else f"{len(waiting)} jobs"
@@ -144,12 +144,12 @@ class _Leases:
             self._all[job].report(share)
 
     def release(self, job: Job) -> None:
-        """Give the lease of a job back."""
+        """Release the lease of a job."""
         if job in self._all:
             self._all[job].release()
 
     def close(self) -> None:
-        """Give all leases back."""
+        """Release all leases."""
         for lease in self._all.values():
             lease.release()
 

@@ -1,4 +1,4 @@
-"""What each definition assumes, for the metrics that a success matrix allows, in families of one question."""
+"""What the metrics that a success matrix allows assume, in families that answer the same question."""
 
 from __future__ import annotations
 
@@ -86,4 +86,4 @@ INSTEAD = {
     "forgetting_chaudhry": "`forgetting` is the same over the stages since a target was learned, with the "
     "retained skills counted in.",
 }
-"""What stands in for a definition where a table lacks cells that few tables have."""
+"""Substitutes for definitions that need cells which few tables have."""

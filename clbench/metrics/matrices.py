@@ -20,14 +20,14 @@ Unit = Literal["share", "percent"]
 MOST: dict[Unit, float] = {"share": 1.0, "percent": 100.0}
 """The greatest success rate in each unit."""
 ROUNDING = 1e-9
-"""Share by which a mean of rates may exceed the greatest one: the last bits of a sum."""
+"""Share by which a mean of rates may exceed the greatest rate, because of the last bits of a sum."""
 DOUBTFUL = 2.0
-"""Greatest rate, above 1, that may well be a wrong share."""
+"""Greatest rate above 1 that may well be an erroneous share."""
 MIXED = 0.25
-"""Share of a method's rates other than 0 that are at most 1, from which on they may be shares."""
+"""If at least this share of a method's nonzero rates is at most 1, these rates may be shares."""
 
 Names = Sequence[str]
-"""Names of tasks; a text is one name."""
+"""Names of tasks; a single string is one name."""
 
 
 class Cell(NamedTuple):
@@ -49,7 +49,7 @@ class Cell(NamedTuple):
 
 
 def _names(names: Names) -> tuple[str, ...]:
-    """Return names as a tuple; a text alone is one name, and not its letters."""
+    """Return names as a tuple; a single string is one name, and not its letters."""
     return (names,) if isinstance(names, str) else tuple(names)
 
 
@@ -65,22 +65,22 @@ def from_matrix(
     """Return every metric that a success matrix allows, and the reasons why the others have no value.
 
     Args:
-        matrix: Success rates, (stages, tasks) or (seeds, stages, tasks), NaN where missing; or several of
-            them by the name of the method. Row k is the end of stage k, in which target k is learned. A row
-            more than there are targets is stage 0, before the first target. The metric gain compares with a
-            method called sft, intransigence with one called joint.
-        tasks: Names of the columns. Without them, they are "task 1", "task 2" and so on.
-        retained: Names of the tasks that are known before the first target and never trained again; a text
-            is one name, here and below.
-        target: Names of the tasks that are learned, in their order. Without them, they are all tasks that are
+        matrix: Success rates, (stages, tasks) or (seeds, stages, tasks), NaN where missing; or several such
+            arrays by the name of the method. Row k is the end of stage k, in which target k is learned. If
+            there is one row more than targets, the first row is stage 0, before the first target. The metric
+            gain compares with a method called sft, and intransigence with one called joint.
+        tasks: Names of the columns, by default "task 1", "task 2" and so on.
+        retained: Names of the tasks that are known before the first target and never trained again; a
+            single string is one name, here and below.
+        target: Names of the tasks that are learned, in their order. By default, they are all tasks that are
             neither retained nor held out, in the order of the columns.
         held_out: Names of the tasks that are never trained.
-        unit: "share" if the rates are from 0 to 1, "percent" if they are from 0 to 100. Without it, they are
+        unit: "share" if the rates are from 0 to 1, "percent" if they are from 0 to 100. By default, they are
             shares unless one is above 1; `Report.unit` says what was assumed.
 
     Raises:
-        InputError: A shape does not fit the tasks or the other methods, a rate is no number or out of range,
-            there is no such unit, or the rates leave in doubt which it is.
+        InputError: A shape does not fit the tasks or the other methods, a rate is not a number or is out of
+            range, there is no such unit, or the rates leave the unit in doubt.
         UnknownNameError: There is no such task.
     """
     given = matrix if isinstance(matrix, Mapping) else {"": matrix}
@@ -139,7 +139,7 @@ def matrices_of(cells: Mapping[Cell, float], layout: Layout, unit: Unit | None, 
     Args:
         cells: The success rates that are there, NaN where missing.
         layout: Groups and order of the tasks.
-        unit: Unit of the rates; None to choose it by the rates.
+        unit: Unit of the rates; None to infer it from the rates.
         where: Place of the table for messages, such as "table.csv: ".
     """
     stages = sorted({cell.stage for cell in cells})
@@ -177,7 +177,7 @@ def _likely_unit(known: Mapping[Cell, float], where: str) -> Unit:
 
 
 def _mixed(known: Mapping[Cell, float]) -> str:
-    """Return in words where a table in per cent has rates that look like shares; nothing if it has none."""
+    """Return in words where a table in per cent has rates that look like shares; empty if it has none."""
     small: dict[tuple[str, str], list[bool]] = {}
     for one, rate in known.items():
         if rate > 0:

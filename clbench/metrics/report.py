@@ -1,8 +1,8 @@
-"""The metrics of success matrices: values, the reasons of missing ones, and where the order of methods flips.
+"""The metrics of success matrices: their values, why some are missing, and where the order of methods flips.
 
-All values come from the functions of the registry (`clbench.scoring.metrics`). What a metric needs is found
-by trying: it is computed for a complete matrix without one cell, for each missing cell in turn. If it then
-has no value, it needs this cell.
+All values come from the functions of the registry (`clbench.scoring.metrics`). Trials show which cells a
+metric needs: for each missing cell in turn, the metric is computed for a matrix that lacks only this cell.
+If the metric then has no value, it needs the cell.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     import pandas
 
 PROBES = 64
-"""Matrices that are tried at once; more are hardly faster, and take more memory."""
+"""Number of matrices that are tried at once; more are hardly faster, and take more memory."""
 REPEATED = "gain"
-"""Metric that counts in no flip: it repeats final_average, less that of sft."""
+"""Metric that counts in no flip: it repeats final_average, minus that of sft."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class Flip:
     first: str
     """Name of a method."""
     second: str
-    """Name of another one."""
+    """Name of another method."""
     first_is_better: tuple[str, ...]
     """Definitions by which the first is better."""
     second_is_better: tuple[str, ...]
@@ -102,7 +102,7 @@ class Report:
         return self.matrices.unit
 
     def of(self, metric: str, method: str | None = None) -> Value:
-        """Return the value of a metric for a method; without a name, for the only or first one.
+        """Return the value of a metric for a method; without a name, for the only or first method.
 
         Raises:
             UnknownNameError: There is no such metric or method.
@@ -162,7 +162,7 @@ def _value(metric: Metric, method: str, matrices: Matrices) -> Value:
     value = float(metric.over_runs(rates))
     if not math.isfinite(value):
         return Value(None, reason=_reason(metric, method, matrices))
-    # without one seed each: none of them with one seed
+    # the values without each seed in turn; none if there is one seed
     others = [
         float(metric.over_runs(rates.each(functools.partial(np.delete, obj=place, axis=0))))
         for place in range(len(runs) if len(runs) > 1 else 0)

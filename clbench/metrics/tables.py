@@ -47,13 +47,13 @@ class _Line:
 
 
 def is_table(name: str) -> bool:
-    """Return whether a name is meant as a table: it is a path, ends like a table's, or a file has it."""
+    """Return whether a name is meant as a table: it is a path, ends like a table's, or names a file."""
     ends = name.lower().endswith((".csv", ".tsv", ".txt"))
     return ends or os.sep in name or os.path.isfile(name)  # False for a name that is too long
 
 
 def find(name: Path | str) -> Path:
-    """Return the file of a table: the one at this path, or else the example of this name.
+    """Return the file of a table: the one at this path, or else the example with this name.
 
     Raises:
         InputError: There is neither; the message names the nearest file.
@@ -92,14 +92,14 @@ def from_csv(
 
     Args:
         path: The file, or the name of an example that comes with clbench, such as "robocasa365.csv".
-        retained: As for `from_matrix`, like the arguments below.
-        target: Without it, the targets are in the order of the columns, in a long table in the order in which
-            they first appear.
+        retained: As for `from_matrix`, as are the arguments below.
+        target: By default, the targets are in the order of the columns or, in a long table, in the order in
+            which they first appear.
         held_out: Names of the tasks that are never trained.
         unit: "share" or "percent".
 
     Raises:
-        InputError: The file is missing or no such table; the message names the line and the cell.
+        InputError: The file is missing or is no such table; the message names the line and the cell.
         UnknownNameError: There is no such task.
     """
     path = find(path)
@@ -187,7 +187,7 @@ def _cells(row: dict[str, str], long: bool, where: str) -> list[tuple[Cell, str]
         if row.get(key) == "":
             raise InputError(f"{where}: the {key} has no name.")
     method, seed, stage = (row.pop(key, "") for key in KEYS)
-    stage = stage.removesuffix(".0")  # pandas writes so if a cell of the column is missing
+    stage = stage.removesuffix(".0")  # pandas writes this if a cell of the column is missing
     if not stage.isascii() or not stage.isdigit():
         raise InputError(
             f"{where}: stage must be a whole number, how many targets were learned, not {quoted(stage)}."

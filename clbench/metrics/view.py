@@ -16,7 +16,7 @@ from clbench.metrics.report import Matrices, Report, Value
 from clbench.scoring.metrics import METRICS
 
 UNNAMED = "the matrix"
-"""What a method without a name is called."""
+"""Name that is shown for a method without a name."""
 
 
 def text(report: Report, notes: Sequence[str] = ()) -> Group:
@@ -99,7 +99,7 @@ def _rank(value: Value, higher_is_better: bool | None) -> tuple[bool, float]:
 
 
 def _number(value: Value, method: str, matrices: Matrices) -> str:
-    """Return a value with its interval, or with the reason why there is none beside others that have one."""
+    """Return a value with its interval, or with the reason why it has none while other methods may."""
     if value.value is None:
         return "-"
     if value.low is not None:
@@ -155,7 +155,7 @@ def _some(values: Mapping[str, Value]) -> bool:
 
 
 def as_values(report: Report) -> dict[str, Any]:
-    """Return a report as values for JSON; what is missing is None, with its reason."""
+    """Return a report as values for JSON; a missing value is None, with its reason."""
     matrices = report.matrices
     return {
         "unit": matrices.unit,

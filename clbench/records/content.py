@@ -1,11 +1,11 @@
-"""The hash of a record's content, by which its reader notices damage.
+"""The hash of a record's content, by which a reader detects damage.
 
-It is the SHA-256 of the record's JSON in canonical form: every entry of the file but `content` itself, names
-sorted, no spaces, and all but ASCII escaped. A file may be indented or its entries reordered, but no
-value may change.
+It is the SHA-256 of the record's JSON in canonical form: every entry of the file except `content` itself,
+with sorted names, no spaces, and everything but ASCII escaped. A file may be indented or its entries
+reordered, but no value may change.
 
-The hash finds damage and careless edits. It does not prove honesty: a forger can compute it again. For that
-there are `clbench verify` and the tiers of the leaderboard.
+The hash finds damage and careless edits. It does not prove honesty, since a forger can compute it again:
+`clbench verify` and the tiers of the leaderboard are for that.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def content_hash(values: Mapping[str, Any]) -> str:
     """Return the hash of a record's content, 64 hexadecimal digits.
 
     Args:
-        values: The record as read from JSON, with its `schema`. An entry `content` has no part in the hash.
+        values: The record as read from JSON, with its `schema`. The hash ignores an entry `content`.
     """
     content = {name: value for name, value in values.items() if name != "content"}
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)

@@ -1,4 +1,4 @@
-"""Dataclasses from JSON, checked by the types of their fields."""
+"""Dataclasses from JSON, checked against the types of their fields."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ _WORDS: dict[Any, str] = {
 def load_fields(cls: type[Any], values: Any, what: str, inside: str = "") -> Any:
     """Return the dataclass `cls` with the fields in `values`.
 
-    Every field must be there, no other may, and each value must have exactly the type that the class states:
-    `true` is no whole number, and 1.0 is none.
+    Every field must be present, no other field may be, and each value must have exactly the type that the
+    class states: neither `true` nor 1.0 is a whole number.
 
     Args:
         cls: Dataclass. Its fields are texts, numbers, lists, dictionaries, dataclasses, literals and unions.
@@ -52,12 +52,12 @@ def load_fields(cls: type[Any], values: Any, what: str, inside: str = "") -> Any
 
 @functools.cache
 def _hints(cls: type[Any]) -> dict[str, Any]:
-    # else Python compiles the text of each annotation anew: a sixth of the time to read a record
+    # otherwise Python compiles each annotation anew: a sixth of the time to read a record
     return get_type_hints(cls)
 
 
 def _load(hint: Any, value: Any, where: str) -> Any:
-    """Return `value` as `hint` states, a dataclass made of its fields; refuse another type."""
+    """Return `value` as the type `hint`, a dataclass built from its fields; refuse other types."""
     origin, arguments = get_origin(hint), get_args(hint)
     if hint is Any:
         return value

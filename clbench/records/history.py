@@ -9,9 +9,9 @@ after these words, and left out `order`, `perturb` and costs where they had thei
 no criterion, the shift of the policy was not measured, and nothing was relearned.
 
 Schema 1 knew no tuning runs, evaluated only the target before the end of a stage, on all test episodes and at
-equal distances, asked questions only at the ends of stages, and did not measure changes of the policy. All of
-this follows from its budget, so that its records are converted without a guess. Metrics of quantities that it
-did not measure are missing.
+equal intervals, asked questions only at the ends of stages, and did not measure changes of the policy. All of
+this follows from its budget, so its records are converted without guessing. Metrics of quantities that it did
+not measure are missing.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def _from_1(values: _Values) -> _Values:
 
 
 def _equal_steps(last: Any, points: Any) -> list[int]:
-    """Return the evaluation steps of schema 1, at equal distances up to the last one."""
+    """Return the evaluation steps of schema 1, at equal intervals up to the last one."""
     if type(last) is not int or type(points) is not int or not 1 <= points <= 100 or last < 1:
         raise InputError(
             "scenario: adaptation_steps and evaluation_points of its budget must be whole numbers."

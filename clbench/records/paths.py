@@ -13,10 +13,10 @@ from clbench.spec.identifiers import check_label, check_scenario_id, folder_name
 from clbench.spec.policies import DEFAULT_POLICY, check_policy_name
 
 RECORDS = Path("leaderboard/records")
-"""Folder of the leaderboard's records, from the working directory."""
+"""Folder of the leaderboard's records, relative to the working directory."""
 
 TUNING = Path("leaderboard/tuning")
-"""Folder of the records of tuning runs, from the working directory."""
+"""Folder of the records of tuning runs, relative to the working directory."""
 
 
 def check_folder(folder: Path) -> None:
@@ -38,7 +38,7 @@ def label_of(method: str, changes: Mapping[str, Any]) -> str:
 
 
 def table_name(scenario: str, policy: str) -> str:
-    """Return the name of a run's table: the scenario, with the name of the policy if it is not the usual one.
+    """Return the name of a run's table: the scenario, with the name of any policy but the default.
 
     Example: "clbench/Fetch-v1+discrete_diffusion". Policies of different names never share a table.
 
@@ -56,7 +56,7 @@ def table_parts(table: str) -> tuple[str, str]:
 
 
 def record_name(scenario: str, label: str, seed: int, order: int = 0, policy: str = DEFAULT_POLICY) -> Path:
-    """Return the path of a run's record from the folder of records. No other run has the same.
+    """Return the path of a run's record, relative to the folder of records and unique to the run.
 
     Args:
         scenario: Gymnasium id.
@@ -80,14 +80,14 @@ def record_path(
 ) -> Path:
     """Return the path of a run's record below the folder `records`, see `record_name`.
 
-    The folder of the same name without .json, which holds the policies or logs of the run, is checked, too.
+    The folder of the same name without .json, which holds the policies or logs of the run, is also checked.
 
     Raises:
         InputError: A name is refused, or a symbolic link leads out of the folder.
     """
     path = records / record_name(scenario, label, seed, order, policy)
     for place in (path.parent, path.with_suffix("")):
-        # a link that leads to itself is left to who reads or writes there: `Path.resolve` would raise
+        # a link to itself is left to the code that reads or writes there: `Path.resolve` would raise
         if not Path(os.path.realpath(place)).is_relative_to(os.path.realpath(records)):
             raise InputError(f"{place}: a symbolic link leads out of {records}.")
     return path
@@ -99,11 +99,11 @@ def stage_folder(root: Path, number: int) -> Path:
 
 
 def free_name(path: Path, ending: str) -> Path:
-    """Return the path for a record that is set aside, next to its own: "seed-0.json.old", or with a number.
+    """Return a free path next to a record, to set it aside: "seed-0.json.old", or the same with a number.
 
     Args:
         path: Path of the record.
-        ending: What follows its name. No reader of records looks for such names.
+        ending: Suffix to its name. Readers of records ignore such names.
     """
     names = (path.with_name(f"{path.name}.{ending}{number or ''}") for number in itertools.count())
     return next(name for name in names if not os.path.lexists(name))

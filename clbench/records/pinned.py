@@ -20,7 +20,7 @@ def pinned_file() -> Path:
 
 
 LATER = ("rule ", "camera")
-"""Beginnings of the names of parts that the first definitions lacked."""
+"""Prefixes of the names of parts that the first definitions lacked."""
 
 
 @cache
@@ -30,13 +30,13 @@ def pinned() -> Mapping[str, Mapping[str, str]]:
 
 
 def other_parts(recorded: Any, known: Mapping[str, str]) -> list[str]:
-    """Return the parts of the definition `known` that `recorded` defines otherwise.
+    """Return the parts of the definition `known` that `recorded` defines differently.
 
     Args:
         recorded: `fingerprint["definition"]` of a record, which a stranger may have written. None in a record
             that is older than definitions: it is not known to differ.
-        known: The definition to compare with. The names of all parts are from it. Parts of `LATER` that one
-            of the two lacks are not known to differ.
+        known: The definition to compare with, which names all parts. Parts of `LATER` that one of the two
+            lacks are not known to differ.
     """
     if recorded is None:
         return []
@@ -49,7 +49,7 @@ def other_parts(recorded: Any, known: Mapping[str, str]) -> list[str]:
 
 
 def other_versions(recorded: Any, installed: Mapping[str, str]) -> list[str]:
-    """Return in words which packages a record was made with in another version: "mujoco was 3.1 and is 3.2".
+    """Return in words which packages have other versions than in a record: "mujoco was 3.1 and is 3.2".
 
     Args:
         recorded: `fingerprint["versions"]` of a record, which a stranger may have written. A package that it
@@ -65,9 +65,9 @@ def other_versions(recorded: Any, installed: Mapping[str, str]) -> list[str]:
 
 
 def machine_of(fingerprint: Mapping[str, Any]) -> str | None:
-    """Return the kind of processor in a fingerprint, None if it has none that is known.
+    """Return the kind of processor in a fingerprint, None if it names no known kind.
 
-    MuJoCo's builds for ARM fuse multiplications and additions, so that some worlds move otherwise there.
+    MuJoCo's builds for ARM fuse multiplications and additions, so that some worlds move differently there.
     """
     hardware = fingerprint.get("hardware")
     found = hardware.get("machine") if isinstance(hardware, dict) else None

@@ -28,13 +28,13 @@ from clbench.spec.identifiers import check_plain
 from clbench.spec.scenario import MOST_ORDERS
 
 MOST_ROWS = 200_000
-"""Rows of a table. A record of Fetch-v1 has 1,780 episodes."""
+"""Most rows of a table. A record of Fetch-v1 has 1,780 episodes."""
 
 FIRST_HASHED = 3
-"""Schema whose records, and those of later ones, have a hash of their content."""
+"""First schema whose records have a hash of their content."""
 
 FIRST_DEFINED = 4
-"""Schema whose records, and those of later ones, have the definition of their scenario."""
+"""First schema whose records have the definition of their scenario."""
 
 ERROR_FIELDS = ("where", "type", "message", "traceback")
 """Names of the texts in `Record.error`."""
@@ -56,8 +56,8 @@ def read_record(path: Path | str) -> Record:
 
     Raises:
         RecordError: The file is not a regular file of JSON within the limits, is of an unknown schema, has a
-            field too many or too few or of another type, its columns do not fit together, or its content does
-            not match its hash.
+            field that is missing, unknown or of another type, has columns that do not fit together, or does
+            not match the hash of its content.
     """
     try:
         return _record(read_json(Path(path)))
@@ -67,7 +67,7 @@ def read_record(path: Path | str) -> Record:
 
 
 def _may_be_sound(error: Exception) -> bool:
-    """Return whether an error in reading says nothing against the record itself."""
+    """Return whether a reading error says nothing against the record itself."""
     return isinstance(error, UnreadableRecordError) or refusal(error) is not None
 
 
@@ -86,7 +86,7 @@ def home_of(run: RunInfo) -> Path:
 
 
 def check_home(run: RunInfo, path: Path, records: Path | None = None) -> Path:
-    """Return `home_of` a run, if its record has that place.
+    """Return `home_of` a run, if its record is in that place.
 
     Args:
         run: The run.
@@ -157,7 +157,7 @@ def _check_definition(record: Record, schema: int) -> None:
 
 def _check_costs(costs: Costs) -> None:
     for name, value in vars(costs).items():
-        # a method may leave parameters out, but nothing else is less than nothing
+        # a method may remove parameters, but no other cost can be negative
         if value is not None and value < 0 and name != "parameters_added":
             raise RecordError(f"costs: {name} must not be below 0.")
 
@@ -178,7 +178,7 @@ def _check_error(record: Record) -> None:
 
 
 def _check_budget(budget: dict[str, Any]) -> None:
-    """Refuse counts that no budget has: what it demands is listed, and compared with what was done."""
+    """Refuse impossible counts: what a budget demands is listed, and compared with what was done."""
     questions, curve, episodes = (
         budget.get(name, 0) for name in ("test_questions", "curve_episodes", "test_episodes")
     )

@@ -82,7 +82,7 @@ class AnswerRow(NamedTuple):
 class PolicyRow(NamedTuple):
     """A row of `Record.policy`: how far the policy has moved at one point.
 
-    Only the ends of stages have the last two. Each value may be None.
+    The last two are measured only at the ends of stages. Each value may be None.
     """
 
     stage: int
@@ -103,7 +103,7 @@ class PolicyRow(NamedTuple):
 
 
 class CheckRow(NamedTuple):
-    """A row of `Record.checks`: a check whether the target is learned.
+    """A row of `Record.checks`: a check of whether the target is learned.
 
     A check plays the target's validation episodes until its outcome is certain.
     """
@@ -127,7 +127,7 @@ class Relearning:
     successes: int
     """Successes of the final policy in the skill's validation episodes."""
     steps: int
-    """Optimiser steps until the criterion was met; without success the most of a stage."""
+    """Optimiser steps until the criterion was met; if it was not, the most steps of a stage."""
     met: bool
     """Whether the criterion was met."""
 
@@ -141,7 +141,7 @@ ONLINE_USES: dict[str, Any] = {
 """`RunInfo.uses` of an agent: it uses no prior data of clbench, and another program trains it."""
 
 EXTERNAL_USES: dict[str, Any] = {"external": True}
-"""`RunInfo.uses` of a policy that was trained elsewhere. Nothing is known of its data: it may even have
+"""`RunInfo.uses` of a policy that was trained elsewhere. Nothing is known about its data: it may even have
 learned from the demonstrations of clbench, which can be exported."""
 
 
@@ -165,13 +165,13 @@ class RunInfo:
     """Hyper-parameters that differ from those tuned for the scenario or, without tuning, from the method's
     defaults, by name."""
     uses: dict[str, Any]
-    """The prior data that the method may touch; `online` is true for an agent of another program, and
-    `external` for a policy that a server offered, of whose data nothing is known."""
+    """The prior data that the method may read; `online` is true for an agent of another program, and
+    `external` for a policy that a server offered, about whose data nothing is known."""
     order: int = 0
     """Order in which the targets were learned; 0 is the published one. See
     `clbench.spec.scenario.target_order`."""
     perturb: bool = False
-    """Whether the retained skills also met perturbed episodes."""
+    """Whether the retained skills were also evaluated on perturbed episodes."""
     policy: str = DEFAULT_POLICY
     """Name of the policy."""
 
@@ -207,8 +207,9 @@ class ScenarioInfo:
 
         Args:
             split: The split that is scored.
-            perturb: Whether the retained skills and each stage's target also meet perturbed episodes.
-            ends: Steps of each stage of a finished run; None before it, or if all stages are equally long.
+            perturb: Whether the retained skills and each stage's target are also evaluated on perturbed
+                episodes.
+            ends: Steps of each stage, once the run has finished; None before, or if all are equally long.
         """
         return Protocol(
             retained=tuple(self.retained),
@@ -227,7 +228,7 @@ class ScenarioInfo:
 
 @dataclass
 class Costs:
-    """What a run cost. A cost that is not known is None: a failed run need not have all of them."""
+    """What a run cost. A cost that is not known is None: a failed run may lack some costs."""
 
     optimiser_steps: int | None = None
     """Optimiser steps, including the preparation."""
@@ -236,9 +237,9 @@ class Costs:
     preparation_steps: int | None = None
     """Optimiser steps before the first target."""
     parameters_added: int | None = None
-    """Parameters that the final policy has more than the pretrained one; negative if it has fewer."""
+    """Parameters of the final policy minus those of the pretrained one; negative if it has fewer."""
     bytes_kept: int | None = None
-    """Bytes of prior data and of method state that a stage passes to the next one, where they are most."""
+    """Bytes of prior data and of method state that a stage passes to the next one, the most of any stage."""
     environment_steps: int | None = None
     """Environment steps of an agent that learned online."""
 
@@ -291,13 +292,13 @@ class Record:
         return f"<p>{html.escape(repr(self))}</p>{table}"
 
     def frame(self) -> pandas.DataFrame:
-        """Return its evaluation episodes as a table, see `clbench.load_records`."""
+        """Return the evaluation episodes as a table, see `clbench.load_records`."""
         from clbench.records.tables import frame
 
         return frame(self)
 
     def matrix(self) -> pandas.DataFrame:
-        """Return its success rates at the ends of stages (rows) on all tasks (columns), with labels."""
+        """Return the success rates at the ends of stages (rows) on all tasks (columns), with labels."""
         from clbench.records.tables import matrix
 
         return matrix(self)
@@ -320,13 +321,13 @@ class Record:
 
     @property
     def failure(self) -> str | None:
-        """Where the run failed and of what, as "stage 1 (push): ValueError: no"; None if it did not."""
+        """Where and why the run failed, such as "stage 1 (push): ValueError: no"; None if it did not."""
         if self.error is None:
             return None
         return ": ".join(self.error[name] for name in ("where", "type", "message"))
 
     def retained_at_start(self) -> float | None:
-        """Return the success on the retained skills before the first target; None without any."""
+        """Return the success on the retained skills before the first target; None if there are none."""
         found = [
             row.success
             for row in self.episode_rows()
@@ -351,7 +352,7 @@ class Record:
         _append(self.policy, row)
 
     def drop_stages(self, first: int) -> None:
-        """Remove the stages from `first` on, of a run whose stages other programs train one by one."""
+        """Remove the stages from `first` on, for a run whose stages another program trains one by one."""
         for table in (self.episodes, self.answers):
             stays = [stage < first for stage in table["stage"]]
             for column in table.values():

@@ -1,4 +1,4 @@
-"""A record as tables of pandas."""
+"""A record as pandas tables."""
 
 from __future__ import annotations
 
@@ -74,5 +74,5 @@ def matrix(record: Record) -> pandas.DataFrame:
 
 
 def typed(found: pandas.DataFrame) -> pandas.DataFrame:
-    """Return a table with its columns in order and with their types, also if it has no rows."""
+    """Return a table with its columns in order and with their types, even if it has no rows."""
     return found.astype(TYPES)[list(TYPES)]

@@ -27,15 +27,15 @@ CUT = "\n[... clbench left out {count:,} characters ...]\n"
 
 
 def write_record(record: Record, path: Path) -> None:
-    """Write `record` to `path` in one step: a reader sees the whole file or none.
+    """Write `record` to `path` in one step: a reader sees the whole file or no file.
 
     Every written record can be read: texts of the error are cut to `LONGEST_TEXT` characters, and anything
     else that `read_record` would refuse is refused before `path` is touched. A symbolic link at `path` is
     replaced, and its target is left alone.
 
     Raises:
-        InputError: The record could not be read again: a field does not fit the schema, is no JSON, or is too
-            large.
+        InputError: The record could not be read again: a field does not fit the schema, is not JSON, or is
+            too large.
     """
     check_diagnostics(record.diagnostics)
     text = record_text(record)
@@ -47,10 +47,10 @@ def write_record(record: Record, path: Path) -> None:
 
 
 def write_result(record: Record, path: Path) -> None:
-    """Write the record of a run, and lose none of a run that succeeded, or may have.
+    """Write the record of a run, but keep an earlier record whose run succeeded, or may have succeeded.
 
-    If this run failed, such a record stays in its place. If it is of other settings, another budget or
-    another device, its file is kept next to the new one, with the ending ".old".
+    If this run failed, such an earlier record stays in its place. If the earlier record has other settings,
+    another budget or another device, its file is kept next to the new one, with the ending ".old".
 
     Raises:
         InputError: As for `write_record`.
@@ -67,7 +67,7 @@ def write_result(record: Record, path: Path) -> None:
         return
     if is_kept and is_other:
         aside = free_name(path, "old")
-        with replacing(aside) as partial:  # and not renamed: a reader finds a record there at any time
+        with replacing(aside) as partial:  # copied, not renamed: a reader finds a record there at any time
             shutil.copyfile(path, partial)
         LOG.warning("%s was of other settings, another budget or device: it is now %s.", path, aside.name)
     write_record(record, path)
@@ -105,7 +105,7 @@ def check_diagnostics(diagnostics: dict[str, Any]) -> None:
         diagnostics: `Record.diagnostics`: what a method reported, by stage.
 
     Raises:
-        InputError: They are no JSON within the limits, or larger than `MOST_DIAGNOSTICS`.
+        InputError: They are not JSON within the limits, or larger than `MOST_DIAGNOSTICS`.
     """
     try:
         text = json.dumps(diagnostics, allow_nan=False)
@@ -126,7 +126,7 @@ def _check_readable(path: Path) -> None:
 
 
 def _fields(value: Any) -> Any:
-    """Return the fields of a dataclass by name, all else as it is; `asdict` copies each entry of a table."""
+    """Return the fields of a dataclass by name, other values as they are; `asdict` copies each entry."""
     if not dataclasses.is_dataclass(value):
         return value
     return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}

@@ -1,9 +1,9 @@
-"""Online learning: an agent of any library learns a scenario by trial and error, and leaves a record.
+"""Online learning: an agent from any library learns a scenario by trial and error, and leaves a record.
 
 The agent brings its own loop: it trains in the environment of one stage after another, and is evaluated after
-each, on the same test episodes from the same initial states as every run. Its record has no answers to
-questions, no evaluation points within a stage, and no count of optimiser steps. Until the last stage the
-record is kept beside its final place: an interrupted program loses only the stage that was running.
+each, on the same test episodes with the same initial states as every run. Its record has no answers to
+questions, no evaluation points within a stage, and no count of optimiser steps. Until the last stage ends,
+the record is kept beside its final path: an interrupted program loses only the stage that was running.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ from clbench.spec.scenario import Scenario
 LOG = logging.getLogger("clbench")
 
 UNFINISHED = ".unfinished"
-"""Ending of the name of a record, after .json, until its last stage: it is no record yet."""
+"""Suffix after .json in the name of an unfinished record, which lacks stages and does not count yet."""
 
 _LEASES: dict[Path, Lease] = {}
 """Leases of the runs that this process has begun, by the path of the unfinished record.
 
-A program trains much longer than it evaluates: it keeps the lease from its first stage until the record is
-written or it ends, so that no other program drops or continues the stages of its agent.
+A program trains much longer than it evaluates. It therefore keeps the lease from its first stage until it
+ends or the record is written, so that no other program drops or continues the stages of its agent.
 """
 
 
@@ -72,23 +72,23 @@ def evaluate_agent(
     Evaluate each stage once and in order, from stage 0. Evaluating stage 0 again starts over.
 
     Args:
-        agent: Agent after its training in the stage. It observes what `env` returns without its wrappers. Its
-            actions should not be random; NaN counts as 0.
-        env: Environment in which the agent was trained: `gymnasium.make(ID, stage=k)`, or several side by
-            side, of Gymnasium or of Stable-Baselines3. It gives the scenario, the stage, the format of
-            instructions and the number of environment steps.
+        agent: Agent after its training in the stage. It gets the observations that `env` returns without its
+            wrappers. Its actions should not be random; NaN counts as 0.
+        env: Environment in which the agent was trained: `gymnasium.make(ID, stage=k)`, or a vectorised one
+            from Gymnasium or Stable-Baselines3. It gives the scenario, the stage, the format of instructions
+            and the number of environment steps.
         method: Name of the agent's row on the leaderboard, for example "me/sac".
         seed: Seed of the run; it chooses the initial states, the same for all methods. From 100 on,
             validation episodes are played.
         steps: Number of environment steps in the stage, if they were not taken in `env` itself.
         settings: Settings of the agent that readers should know, as JSON; the same in all stages.
-        batched: Whether `predict` gets the observations of 40 episodes at once, arrays (40, ...) by name, and
-            returns actions (40, A); several times faster. By default it does for agents of Stable-Baselines3
-            that read tokens; others get one observation at a time, and play one episode after another.
+        batched: Whether `predict` gets the observations of 40 episodes at once, as arrays (40, ...) by name,
+            and returns actions (40, A); several times faster. By default, agents from Stable-Baselines3 that
+            read tokens do; others get one observation at a time, and play one episode after another.
         records: Folder of the records.
 
     Returns:
-        The record so far. Base no choice on test episodes; choose with a seed from 100 on.
+        The record so far. Base choices on seeds from 100 on, never on test episodes.
 
     Raises:
         WrongTypeError: `env` is not an environment of a scenario, or `agent` cannot act.
@@ -97,7 +97,7 @@ def evaluate_agent(
             the scenario or its simulator, an action has the wrong shape, an agent of Stable-Baselines3 was
             trained behind a wrapper that changes observations or actions, or the name, the seed, the steps
             or the settings are invalid.
-        LeaseLostError: Another program took the run over, because this one did not answer.
+        LeaseLostError: Another program took over the run, because this one did not respond.
     """
     training = training_of(env)
     scenario, stage = training.scenario, training.stage
@@ -129,7 +129,7 @@ def evaluate_agent(
 
 
 def next_stage(scenario: str, *, method: str, seed: int = 0, records: Path | str = RECORDS) -> int:
-    """Return the stage that `evaluate_agent` expects next: an interrupted program continues with it.
+    """Return the stage that `evaluate_agent` expects next, with which an interrupted program continues.
 
     Args:
         scenario: Gymnasium id of the scenario.
@@ -149,9 +149,9 @@ def next_stage(scenario: str, *, method: str, seed: int = 0, records: Path | str
 
 @dataclass(frozen=True)
 class StagedRun:
-    """A run whose policy another program trains, an agent or a policy that is served.
+    """A run whose policy is trained by another program: an agent or a served policy.
 
-    It is evaluated stage by stage. Its record so far decides with which stage it goes on.
+    It is evaluated stage by stage. Its record so far determines which stage comes next.
     """
 
     scenario: Scenario
@@ -193,7 +193,7 @@ class StagedRun:
 
     @property
     def split(self) -> ScoredSplit:
-        """Split that is scored: all seeds share the test wordings, on which no setting may be chosen."""
+        """Split that is scored. Tuning seeds avoid "test": its wordings are the same for all seeds."""
         return "validation" if self.seed >= FIRST_TUNING_SEED else "test"
 
     @cached_property
@@ -203,7 +203,7 @@ class StagedRun:
 
     @property
     def unfinished(self) -> Path:
-        """Path of the record until the last stage."""
+        """Path of the record until its last stage has been evaluated."""
         return self.path.with_name(self.path.name + UNFINISHED)
 
     @cached_property
@@ -217,8 +217,8 @@ class StagedRun:
         """Return the record so far, None if no stage has been evaluated.
 
         Args:
-            stale: Return also stages of another version of the scenario or its simulator, and None for a
-                damaged file: the run starts over.
+            stale: Whether to return stages of another version of the scenario or its simulator, too, and None
+                for a damaged file, because the run starts over.
 
         Raises:
             InputError: The record is of another kind of run, or of another version and not finished.
@@ -249,7 +249,7 @@ class StagedRun:
         return record
 
     def _check_version(self, record: Record) -> None:
-        """Refuse stages whose episodes were not those of the present scenario and simulator."""
+        """Refuse stages that were evaluated with another version of the scenario or its simulator."""
         then, now = record.fingerprint, self._fingerprint
         other = [
             *other_parts(vars(record.scenario), vars(describe_scenario(self.scenario))),
@@ -268,7 +268,7 @@ class StagedRun:
         )
 
     def next_after(self, record: Record | None) -> int:
-        """Return the stage that follows on those of a record; the last one plus one if it has all."""
+        """Return the stage that follows those in a record; the last stage plus one if it has all."""
         return 0 if record is None else 1 + max(record.episodes["stage"], default=-1)
 
     def check_unfinished(self) -> None:
@@ -278,14 +278,14 @@ class StagedRun:
             raise InputError(f"{told}: choose another seed or name, or remove it.")
 
     def plan(self, stage: int, again: bool) -> Record | None:
-        """Return the record so far, if a stage comes next or has been evaluated.
+        """Return the record so far, after checking that a stage may be evaluated now.
 
         Args:
-            stage: Stage that shall be evaluated.
-            again: Whether it shall replace the same stage; stage 0 replaces those of other versions, too.
+            stage: Stage to evaluate.
+            again: Whether to evaluate a stage again; stage 0 also replaces stages of other versions.
 
         Raises:
-            InputError: There is no such stage, or an earlier one comes next; and as for `kept`.
+            InputError: There is no such stage, or an earlier one comes next; also as for `kept`.
             RecordError: The file is damaged.
         """
         if not is_whole(stage) or not 0 <= stage <= self.last:
@@ -299,7 +299,7 @@ class StagedRun:
         return record
 
     def _own(self) -> None:
-        """Take the run for this process, unless it has it."""
+        """Take the lease of the run, unless this process already has it."""
         if self.unfinished not in _LEASES:
             lease = Lease(self.unfinished)
             while not lease.take():
@@ -311,18 +311,18 @@ class StagedRun:
         _LEASES[self.unfinished].check()
 
     def begin(self, stage: int, settings: dict[str, Any] | None, agent: Any, again: bool) -> Record:
-        """Take the run for this process, and return the record of the earlier stages.
+        """Take the lease of the run, and return the record of the earlier stages.
 
         Args:
-            stage: Stage that is evaluated.
-            settings: Settings that readers should know, the same in all stages; None for those of stage 0.
+            stage: Stage to evaluate.
+            settings: Settings that readers should know, the same in all stages; None takes those of stage 0.
             agent: The agent or policy.
-            again: Whether to drop the stage and all later ones if it has been evaluated; earlier ones stay.
+            again: Whether to drop an evaluated stage and all later ones; earlier ones stay.
 
         Raises:
             InputError: Another stage comes next, settings differ from those in stage 0, or another process
-                has taken the run; and as for `plan`.
-            LeaseLostError: Another process took the run over.
+                has taken the run; also as for `plan`.
+            LeaseLostError: Another process took over the run.
         """
         owned = self.unfinished in _LEASES
         try:
@@ -407,10 +407,10 @@ class StagedRun:
         record.timing["seconds"] = None if None in parts else round(sum(parts), 2)
 
     def keep(self, record: Record, stage: int) -> None:
-        """Write the record: to its final path after the last stage, which ends the run, beside it before.
+        """Write the record beside its final path; after the last stage, write it there and end the run.
 
         Raises:
-            LeaseLostError: Another process took the run over.
+            LeaseLostError: Another process took over the run.
         """
         _LEASES[self.unfinished].check()
         if stage < self.last:
@@ -426,7 +426,7 @@ class StagedRun:
 
 
 def _describe(agent: Any) -> dict[str, Any]:
-    """Return the class of an agent and the version of its package, None without a package."""
+    """Return the class of an agent and the version of its package, None if it has no package."""
     kind = type(agent)
     packages = packages_distributions().get(kind.__module__.partition(".")[0], [])
     return {
@@ -436,7 +436,7 @@ def _describe(agent: Any) -> dict[str, Any]:
 
 
 def _checked_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings in the form of a record.
+    """Return settings as a record holds them.
 
     Raises:
         InputError: JSON cannot hold the settings.

@@ -212,7 +212,7 @@ class Film:
         return frame
 
     def save(self, path: Path, fps: int) -> None:
-        """Write the film, in one step, as GIF or MP4 according to the name of the file.
+        """Write the film, in one step, as GIF or MP4 depending on the name of the file.
 
         Args:
             path: Path of the film.
@@ -280,7 +280,7 @@ def film_runs(
     width: int,
     progress: ProgressCallback = no_progress,
 ) -> Film:
-    """Return the film of one run or of several of the same scenario and seed.
+    """Return the film of one run, or of several runs of the same scenario and seed.
 
     Args:
         runs: The runs.
@@ -303,7 +303,7 @@ def film_runs(
 
 
 def column_of(run: ResolvedRun, stage: int, *, alone: bool) -> str:
-    """Return the caption of a stage's column; with other methods beside it, it names the method."""
+    """Return the caption of a stage's column; beside other methods, it also names the method."""
     when = f"after {run.scenario.target[stage - 1].name}" if stage else "before any target"
     if alone:
         return f"stage {stage}, {when}"
@@ -313,7 +313,7 @@ def column_of(run: ResolvedRun, stage: int, *, alone: bool) -> str:
 
 
 def frames_per_second(task: Task) -> int:
-    """Return the speed of a task's films: that of its world, at most `FASTEST`; 25 if it has none."""
+    """Return the frame rate of a task's films: that of its world (25 if it has none), at most `FASTEST`."""
     return min(int(control_rate(task) or 25), FASTEST)
 
 

@@ -1,4 +1,4 @@
-"""The fingerprint of a record: software and hardware of a score, down to the bits of the simulator."""
+"""The fingerprint of a record: the software and hardware behind a score, down to the simulator's bits."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def fingerprint(scenario: Scenario, device: str = "cpu") -> dict[str, Any]:
 
     Args:
         scenario: The scenario.
-        device: Device on which the policy is computed, in PyTorch's words.
+        device: Device on which the policy is computed, as PyTorch names it.
     """
     from clbench.evaluation.definition import definition  # imports torch, see `_hardware`
 
@@ -83,10 +83,10 @@ def fingerprint(scenario: Scenario, device: str = "cpu") -> dict[str, Any]:
 
 
 def describe_policy(scenario: Scenario, seed: int) -> dict[str, str | None]:
-    """Return what a record says of a policy class of one's own, by name of the entry in the fingerprint.
+    """Return the entries of a fingerprint that describe a policy class of your own, by name.
 
-    "policy" is the hash of its source, None for a built-in policy. "weights" is there only for a class that
-    brings pretrained weights: their hash, since they may lie in a file that somebody replaces.
+    "policy" is the hash of its source, or None for a built-in policy. "weights" is there only for a class
+    that brings pretrained weights. It is their hash, because the file that holds them may be replaced.
     """
     source = policy_source(scenario.policy)
     if source is None:
@@ -105,7 +105,7 @@ def _commit() -> dict[str, Any] | None:
     try:
         git = ["git", "-C", os.fspath(folder.parent)]
         head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
-        # runs make records and the table, which do not affect later runs
+        # runs write records and the table, which do not affect later runs
         code = ["clbench", "envs", "methods", "pyproject.toml", "constraints.txt"]
         changed = subprocess.run(
             [*git, "status", "--porcelain", "--", *code], capture_output=True, text=True, check=True
@@ -116,8 +116,8 @@ def _commit() -> dict[str, Any] | None:
 
 
 def _hardware(device: str) -> dict[str, str]:
-    """Return what affects rounding: processors of the same name may have different instructions."""
-    import torch  # takes seconds, for which environments that only step need not wait
+    """Return the hardware that affects rounding: processors of one name may have different instructions."""
+    import torch  # takes seconds, for which code that only steps environments need not wait
 
     gpu = {"gpu": torch.cuda.get_device_name(device)} if torch.device(device).type == "cuda" else {}
     return {
@@ -131,10 +131,10 @@ def _hardware(device: str) -> dict[str, str]:
 
 
 def arithmetic(device: str) -> dict[str, str]:
-    """Return the hardware that decides the bits of a run: one that changes it midway cannot be repeated.
+    """Return the hardware that determines a run's bits: a run that changes it midway cannot be repeated.
 
-    The maker of the processor counts, because MKL, which multiplies PyTorch's matrices, has other code for
-    Intel's processors than for others with the same instructions.
+    The maker of the processor counts, because MKL, which multiplies PyTorch's matrices, runs other code on
+    Intel's processors than on others with the same instructions.
     """
     hardware = {**_hardware(device), "maker": _cpu_info("vendor_id")}
     names = ("gpu", "machine", "maker", "instructions", "arithmetic")
@@ -143,11 +143,12 @@ def arithmetic(device: str) -> dict[str, str]:
 
 @lru_cache(maxsize=1)
 def arithmetic_hash() -> str:
-    """Return a hash of how this processor computes with PyTorch: of small layers after three steps of AdamW.
+    """Return a hash of this processor's arithmetic in PyTorch: small layers after three steps of AdamW.
 
-    Names do not decide the bits. Environment variables give MKL and PyTorch other code on the same processor,
-    and processors with the same instructions differ. The layers use what policies use: matrix products of two
-    sizes, attention, normalisation, convolution, exponentials, sums and the fused optimiser. It takes 0.2 s.
+    Names do not determine the bits. Environment variables make MKL and PyTorch run other code on the same
+    processor, and processors with the same instructions differ. The layers use what policies use: matrix
+    products of two sizes, attention, normalisation, convolution, exponentials, sums and the fused optimiser.
+    The computation takes 0.2 s.
     """
     import torch
     from torch import nn

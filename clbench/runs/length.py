@@ -24,7 +24,7 @@ def run_length(scenario: Scenario, protocol: Protocol) -> float:
 
 
 def watching_length(method: type[Method], scenario: Scenario) -> float:
-    """Return the length of the pretraining that is repeated for a method that watches it, else 0."""
+    """Return the length of the pretraining repeated for a method that watches it, 0 for other methods."""
     from clbench.learning.watching import watches
 
     return float(scenario.budget.pretraining_steps) if watches(method) else 0.0
@@ -44,7 +44,7 @@ def point_length(protocol: Protocol, point: Point) -> float:
 def relearns(protocol: Protocol) -> bool:
     """Return whether a run ends with relearning, see `clbench.runs.relearning`.
 
-    Tuning runs do without: nothing is chosen by it.
+    Tuning runs skip it, because no choice depends on it.
     """
     if protocol.criterion is None or protocol.split != "test":
         return False
@@ -52,7 +52,7 @@ def relearns(protocol: Protocol) -> bool:
 
 
 def relearning_length(protocol: Protocol) -> float:
-    """Return the length of relearning, 0 if the run does without."""
+    """Return the length of relearning, 0 if the run skips it."""
     if not relearns(protocol):
         return 0.0
     return protocol.steps[-1] + EPISODE_WEIGHT * len(protocol.retained) * protocol.validation_episodes

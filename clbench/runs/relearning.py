@@ -2,7 +2,7 @@
 
 A skill that comes back within a few steps was hidden rather than lost. All methods are measured alike: a copy
 of the final policy is fine-tuned with all its parameters, adapters included, at the scenario's learning rate,
-until it meets the criterion of the stages. Only what the policy's own class freezes stays frozen.
+until it meets the criterion of the stages. Only parameters that the policy's own class freezes stay frozen.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def relearn(
         trainer: Trainer of the run after the last stage; it does not change.
         examiner: Examiner of the run, which reports the progress of its own episodes.
         checker: Checker of the run.
-        progress: Called with the number of optimiser steps done since its last call, or not to be done.
+        progress: Called with the number of optimiser steps done, or left out, since its last call.
     """
     successes = examiner.successes(trainer.policy)
     skill = min(successes, key=lambda name: successes[name])
@@ -50,7 +50,7 @@ def relearn(
 
 
 def _trainable(policy: Policy, pretrained: Policy) -> Policy:
-    """Return a copy of a policy that trains all but what its own class freezes, such as an image encoder."""
+    """Return a copy that trains everything but what the policy's class freezes, such as an image encoder."""
     frozen = {name for name, one in pretrained.named_parameters() if not one.requires_grad}
     policy = copy.deepcopy(policy)
     for name, parameter in policy.named_parameters():

@@ -52,8 +52,9 @@ def execute(
 ) -> Record:
     """Do a run, or continue an interrupted one, and write its record.
 
-    A run that fails leaves a record of status "failed" that names the place. The record of a run that
-    succeeded stays. If another process does the same run with the same folders, this one waits for its turn.
+    A run that fails leaves a record with the status "failed" that names the place of the failure. It does not
+    replace the record of a run that succeeded. If another process does the same run with the same folders,
+    this one waits for its turn.
 
     Args:
         run: The run, by name or resolved.
@@ -64,11 +65,12 @@ def execute(
         tensorboard: Folder below which the run is logged for TensorBoard; None logs nothing.
 
     Raises:
-        CacheError: The file system refuses a checkpoint. This is no failure of the method, and leaves no
-            record.
+        CacheError: The file system refuses a checkpoint. The method has not failed, and there is no record.
         CheckpointError: A checkpoint of this run cannot be read.
-        LeaseLostError: Another process took the run over.
+        LeaseLostError: Another process took over the run.
         MachineError: The machine has no room for a file of the method, or its disk or network fails.
+        MissingPackageError: TensorBoard is not installed.
+        RenderingError: No picture can be drawn.
     """
     if tensorboard is not None:
         require_tensorboard()
@@ -92,7 +94,7 @@ def execute(
 
 
 def _resume_folder(run: ResolvedRun, records: Path) -> Path:
-    """Return the folder in the cache from which an interrupted run goes on."""
+    """Return the folder in the cache from which an interrupted run continues."""
     # two commands may do the same run for different folders at once
     return cache_folder() / "runs" / hash_of({**_inputs(run), "records": str(records.resolve())})
 
@@ -144,8 +146,8 @@ def _bytes(value: torch.Tensor | str | float | bool | None) -> int:
 class _Run:
     """A run in progress: the trainer, the examiner, and the record so far.
 
-    After each stage it writes a checkpoint of the trainer and of the record, and the next stage begins with
-    it: an interrupted run therefore continues as if nothing had happened.
+    After each stage it writes a checkpoint of the trainer and of the record, and the next stage starts from
+    this checkpoint. An interrupted run therefore continues as if nothing had happened.
     """
 
     run: ResolvedRun
@@ -156,14 +158,14 @@ class _Run:
     log: Log
     progress: ProgressCallback
     resume_folder: Path
-    """Folder in the cache with the state after each stage, from which an interrupted run goes on."""
+    """Folder in the cache with the state after each stage, from which an interrupted run continues."""
     lease: Lease
     """The right to write into this folder."""
     kept: Path | None
     """Folder below which the policies of all stages are kept."""
     tensorboard: Path | None
     inputs: dict[str, Any]
-    """Everything that these states depend on. Code that changes while a run goes on is not the run's."""
+    """Everything that these states depend on, as of the start: later changes of the code do not count."""
     begin: float = dataclasses.field(default_factory=time.perf_counter)
     seconds_before: float = 0.0
     """Seconds that the run took before it was interrupted."""
@@ -178,7 +180,7 @@ class _Run:
         kept: Path | None,
         tensorboard: Path | None,
     ) -> _Run:
-        """Return a run with all its parts; the policy is pretrained, and data collected, on first use."""
+        """Return a run with all its parts; the policy is pretrained and data are collected on first use."""
         scenario, spec = run.scenario, run.spec
         trainer = Trainer.open(scenario, run.new_method, spec.seed, spec.device)
         record = _new_record(run, trainer)
@@ -200,7 +202,7 @@ class _Run:
         )
 
     def go(self) -> Record:
-        """Go through all stages without a checkpoint, and return the record."""
+        """Go through all stages that have no checkpoint yet, and return the record."""
         self.record.timing["started"] = datetime.now(UTC).isoformat(timespec="seconds")
         try:
             with machine_needed():
@@ -223,7 +225,7 @@ class _Run:
         return self.record
 
     def forget(self) -> None:
-        """Remove what an interrupted run goes on from, once the record is written."""
+        """Remove the checkpoints, which are not needed once the record is written."""
         shutil.rmtree(self.resume_folder, ignore_errors=True)
 
     def _go_through(self) -> None:
@@ -332,7 +334,7 @@ class _Run:
         self.record.timing["seconds"] = round(seconds, 2)
 
     def _count_bytes(self, number: int, state: MethodState) -> None:
-        """Count what stage `number` passes on; the row shows the most that any stage does."""
+        """Count the bytes that stage `number` passes on; the record keeps the most of all stages."""
         kept = self.trainer.prior(number, ("throughout",)).bytes + sum(map(_bytes, state.values()))
         kept += sum(buffer.nbytes for buffer in _added_buffers(self.trainer))
         self.record.costs.bytes_kept = max(self.record.costs.bytes_kept or 0, kept)
@@ -340,7 +342,7 @@ class _Run:
     # ---- checkpoints -------------------------------------------------------------------------------
 
     def _save(self, number: int) -> None:
-        """Write a checkpoint after stage `number`, and keep its policy if asked to; remove the one before."""
+        """Write a checkpoint after stage `number`, keep its policy if asked to, and remove the one before."""
         state = self.trainer.state(number)
         self._count_bytes(number, state)
         self.lease.check()

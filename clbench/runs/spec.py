@@ -38,7 +38,7 @@ class RunSpec:
     method: str
     """Name of an installed method, or "module:Class"."""
     seed: int
-    """Seed of every draw of the run."""
+    """Seed of all random draws of the run."""
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Hyper-parameters that differ from those tuned for the scenario or, without tuning, from the method's
     defaults, by name."""
@@ -51,7 +51,7 @@ class RunSpec:
     order: int = 0
     """Order of the targets, see `Scenario.in_order`; 0 is the published one."""
     perturb: bool = False
-    """Whether the retained skills and each stage's target also meet perturbed episodes."""
+    """Whether the retained skills and each stage's target are also evaluated on perturbed episodes."""
     policy: str = DEFAULT_POLICY
     """Name of the policy, see `clbench.spec.policies`."""
 
@@ -128,9 +128,9 @@ class ResolvedRun:
     """Changed hyper-parameters as the method holds them: the text "0.5" may have become a number."""
 
     def new_method(self) -> Method:
-        """Return a new object of the method, with the settings tuned for the scenario but for `changes`.
+        """Return a new object of the method, with the settings tuned for the scenario and then `changes`.
 
-        A tuning run begins with the defaults instead: an earlier choice must not get into a new one.
+        A tuning run begins with the defaults instead: an earlier choice must not influence a new one.
         """
         from clbench.learning.registry import new_method
 
@@ -140,7 +140,7 @@ class ResolvedRun:
 
     @property
     def table(self) -> str:
-        """Name of the table that it belongs to, see `table_name`."""
+        """Name of the table that the run belongs to, see `table_name`."""
         return table_name(self.scenario.id, self.spec.policy)
 
     @cached_property
@@ -150,12 +150,12 @@ class ResolvedRun:
 
     @cached_property
     def defaults(self) -> Mapping[str, Any]:
-        """The method's own hyper-parameters, neither tuned nor changed, as a record holds them."""
+        """The method's default hyper-parameters, neither tuned nor changed, as a record holds them."""
         return _settings_of(self.method())
 
     @cached_property
     def info(self) -> RunInfo:
-        """`Record.run`. Two runs with equal `info` and `scenario_info` are the same run."""
+        """Content of `Record.run`. Two runs with equal `info` and `scenario_info` are the same run."""
         spec, method = self.spec, self.new_method()
         settings = _settings_of(method)
         return RunInfo(
@@ -174,7 +174,7 @@ class ResolvedRun:
 
     @cached_property
     def scenario_info(self) -> ScenarioInfo:
-        """`Record.scenario`."""
+        """Content of `Record.scenario`."""
         return describe_scenario(self.scenario)
 
     @property
@@ -189,7 +189,7 @@ class ResolvedRun:
 
 
 def describe_scenario(scenario: Scenario) -> ScenarioInfo:
-    """Return `Record.scenario`."""
+    """Return the description of a scenario in a record, the content of `Record.scenario`."""
     groups = (scenario.retained, scenario.target, scenario.held_out)
     retained, target, held_out = ([task.name for task in group] for group in groups)
     steps, budget = list(scenario.budget.evaluation_steps), dataclasses.asdict(scenario.budget)
@@ -197,7 +197,7 @@ def describe_scenario(scenario: Scenario) -> ScenarioInfo:
 
 
 def _settings_of(method: Method) -> dict[str, Any]:
-    """Return the hyper-parameters of a method in JSON's types.
+    """Return the hyper-parameters of a method as values of JSON.
 
     Raises:
         InputError: A record cannot hold one of them.
@@ -228,8 +228,8 @@ def check_device(device: str) -> None:
     """Refuse a device that this machine does not have, or on which a run does not repeat itself.
 
     Raises:
-        InputError: PyTorch does not know the name, this machine has no such device, or it is neither a
-            processor nor a GPU of CUDA: Apple's `mps` has operations that differ from call to call.
+        InputError: PyTorch does not know the name, this machine has no such device, or it is neither a CPU
+            nor a CUDA GPU: Apple's `mps` has operations that differ from call to call.
     """
     import torch
 
@@ -240,7 +240,7 @@ def check_device(device: str) -> None:
                 f"The device {device!r} cannot be used: runs repeat themselves on cpu and cuda alone."
             )
         if found.type == "cuda" and (found.index or 0) < torch.cuda.device_count():
-            return  # a tensor there would hold a context, which locks a GPU in exclusive mode for the workers
+            return  # a tensor there would create a context, which keeps workers off a GPU in exclusive mode
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).partition("\n")[0].partition(". ")[0]  # PyTorch goes on for pages

@@ -50,7 +50,7 @@ class MachineError(ClbenchError, OSError):
 
 
 NOT_THE_METHOD = (CacheError, CheckpointError, LeaseLostError, MachineError, RenderingError)
-"""Failures of the machine: a run can be done again, and leaves no record that blames its method."""
+"""Failures of the machine: the run can be repeated, and leaves no record that blames its method."""
 
 
 _ASSERTION = 710
@@ -59,11 +59,11 @@ _ASSERTION = 710
 
 @contextmanager
 def machine_needed() -> Iterator[None]:
-    """Tell a failure of the machine apart from what a method inside does wrong.
+    """Tell a failure of the machine apart from an error of the method that runs inside.
 
     Raises:
         MachineError: The machine has no room; its disk, network or GPU fails; or the file system refuses
-            something to clbench, and not to a function of a method.
+            an operation of clbench itself, not one of a method.
     """
     try:
         yield
@@ -90,7 +90,7 @@ def _machine_error(error: Exception, is_full: bool = False) -> MachineError:
 
 @contextmanager
 def method_needed(run: ResolvedRun, trainer: Trainer) -> Iterator[None]:
-    """Raise what the method of a run inside does wrong as one error that names the place.
+    """Turn any error of the method that runs inside into a `MethodError` that names the place.
 
     Raises:
         CacheError, CheckpointError, LeaseLostError, MachineError, RenderingError: The machine is to blame.
@@ -237,7 +237,7 @@ def _kept(run: ResolvedRun, checkpoints: Path) -> Path:
 
 
 def _made(run: ResolvedRun) -> Path:
-    """Return the folder in the cache for policies that this code made again on hardware like this."""
+    """Return the cache folder of policies that this version of the code made again on hardware like this."""
     made_by = {"method": describe_method(run.method), "hardware": arithmetic(run.spec.device)}
     inputs = {**_identity(run, 0), **made_by, "file": LENGTH, **training_inputs(run.scenario, run.spec.seed)}
     return cache_folder() / "stages" / hash_of(inputs)
@@ -251,7 +251,7 @@ def keep_stage(run: ResolvedRun, checkpoints: Path, number: int, source: Path) -
             shutil.copyfile(source / name, folder / name)
 
     folder = stage_folder(_kept(run, checkpoints), number)
-    shutil.rmtree(folder, ignore_errors=True)  # another version of the code leaves the same identity
+    shutil.rmtree(folder, ignore_errors=True)  # stages of another version of the code have the same identity
     cached(folder, _identity(run, number), write)
 
 
@@ -262,7 +262,7 @@ def drop_stages(run: ResolvedRun, checkpoints: Path) -> None:
 
 
 def _identity(run: ResolvedRun, number: int) -> dict[str, Any]:
-    """Return what identifies the policy of a stage among all runs, whatever the source code."""
+    """Return what identifies the policy of a stage among all runs, regardless of the source code."""
     info = dataclasses.asdict(run.info)
     for name in ("split", "perturb"):  # evaluation episodes make no difference
         del info[name]

@@ -33,11 +33,11 @@ TABLES = ("episodes", "answers", "policy")
 def evaluate_start(
     run: ResolvedRun, examiner: Examiner, policy: Policy, record: Record, progress: ProgressCallback
 ) -> None:
-    """Evaluate a policy before the first target into `record`, or copy the evaluation from the cache.
+    """Fill `record` with the evaluation of a policy before the first target, from the cache if it is there.
 
     Args:
         run: The run.
-        examiner: Evaluates the policies of the run, and reports its progress.
+        examiner: Examiner of the run, which reports its own progress.
         policy: The policy that the method's `prepare` left.
         record: Record of the run, whose tables are still empty.
         progress: Called with the length of the evaluation if the cache has it.
@@ -60,14 +60,14 @@ def evaluate_start(
 
 
 def evaluate_pretrained(run: ResolvedRun, progress: ProgressCallback = no_progress) -> float | None:
-    """Evaluate the pretrained policy, with which runs like `run` start, unless the cache has the evaluation.
+    """Evaluate the pretrained policy from which runs like `run` start, unless the cache has the evaluation.
 
     Args:
         run: One of the runs; its method makes no difference.
         progress: Called with the length of the work done since its last call, in optimiser steps.
 
     Returns:
-        Its success on the retained skills; None without any.
+        Success of this policy on the retained skills; None if there are none.
     """
     run = _of_baseline(run)
     with deterministic(run.spec.device):
@@ -86,7 +86,7 @@ def evaluate_pretrained(run: ResolvedRun, progress: ProgressCallback = no_progre
 def is_evaluated(run: ResolvedRun) -> bool:
     """Return whether the cache has the evaluation of the pretrained policy; the policy must exist.
 
-    On a machine without the GPU of the run it is not known, and False: a worker may have one.
+    On a machine without the GPU of the run, the answer is not known, and False: a worker may have one.
     """
     if torch.device(run.spec.device).type == "cuda" and not torch.cuda.is_available():
         return False
@@ -97,8 +97,8 @@ def is_evaluated(run: ResolvedRun) -> bool:
 def starts_as_pretrained(run: ResolvedRun) -> bool:
     """Return whether `evaluate_start` may take the evaluation that `evaluate_pretrained` leaves.
 
-    Built-in methods change what a policy computes by its weights alone. `prepare` of another one may add a
-    hook or replace `act`, which no weight shows.
+    Built-in methods change what a policy computes through its weights alone. `prepare` of another method may
+    add a hook or replace `act`, which no weight shows.
     """
     return run.method.prepare is Method.prepare or run.spec.method in built_in_methods()
 

@@ -1,8 +1,8 @@
-"""Step time: how long an optimiser step of the method takes, as a ratio to plain fine-tuning.
+"""Step time: how long an optimiser step of the method takes, relative to plain fine-tuning.
 
 At the end of a run the method and plain fine-tuning take turns, in blocks of a few steps, in one process and
-on the same data: other work on the machine affects both alike. They train copies, and nothing of the run
-changes.
+on the same data: other work on the machine affects both alike. They train copies, so that the run itself does
+not change.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ STEPS = 4
 
 
 def step_ratio(trainer: Trainer, stage: Path) -> float | None:
-    """Return the time of a step divided by that of plain fine-tuning, the median over the pairs of blocks.
+    """Return the time of a step divided by plain fine-tuning's, the median over the pairs of blocks.
 
     Args:
         trainer: Trainer of the run after its last stage; it does not change.
         stage: Folder with the files of the last stage.
 
     Returns:
-        None if the method takes no steps, the stage is too short, or the method fails on a second try.
+        The ratio; None if the method takes no steps, the stage is too short, or the method fails here.
     """
     number = len(trainer.scenario.target)
     plain: Callable[[], Method] = functools.partial(load_method(BASELINE), step_factor=1.0)
@@ -58,7 +58,7 @@ def _copy(trainer: Trainer, new_method: Callable[[], Method]) -> Trainer:
 
 
 def _seconds(trainer: Trainer, number: int) -> float | None:
-    """Return the time of a block of steps in seconds; its first step makes the optimiser and is not timed."""
+    """Return the seconds that a block of steps takes, without the first step, which makes the optimiser."""
     marks: list[float] = []
 
     def after(step: Step) -> bool:

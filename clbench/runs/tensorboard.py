@@ -30,8 +30,8 @@ class Log:
     `training/` has the loss and the learning rate every `LOG_STEPS` steps. At every evaluation point,
     `success_test/`, `success_validation/` and `success_perturbed/` have the success rate of each task,
     `question_accuracy/` has the accuracy of each kind of question and of all questions, and `policy/` has the
-    distance from the pretrained policy, at the end of a stage also the shift in it. `diagnostics/` has the
-    numbers among the method's diagnostics.
+    distance from the pretrained policy and, at the end of a stage, the shift within the stage. `diagnostics/`
+    has the numbers among the method's diagnostics.
 
     Args:
         folder: Folder of the event files; None logs nothing.
@@ -94,7 +94,7 @@ def _report(record: Record, point: Point) -> Iterator[tuple[str, float | None]]:
     for tag, successes in outcomes.items():
         yield tag, sum(successes) / len(successes)
     answers = list(_rows(record.answers, point))
-    asked = [row for row in answers if row["asked"]]  # a policy without answers is asked none
+    asked = [row for row in answers if row["asked"]]  # a policy that cannot answer is asked no questions
     for row in asked:
         yield f"question_accuracy/{row['kind']}", row["correct"] / row["asked"]
     if asked:

@@ -1,15 +1,17 @@
 """Tuning: the settings that every method tries on a scenario, the choice among them, and its file.
 
-All methods try the same number of settings, on the same seeds, all targets and validation episodes alone:
+All methods try the same number of settings, on the same seeds, with all targets, and only on validation
+episodes:
 
 1. `RUNGS`: four factors of the learning rate, with the method's own strength at its default.
-2. At the best of them two more settings: two other values of the own strength that the method declares in
-   `Method.tunes`, or, if it declares none, two learning rates on both sides of the rung. Those of the lowest
-   and the highest rung lie outside of the ladder: such a method may try 0.0165, which others cannot.
+2. Two more settings at the best of these rungs: two other values of the strength that the method declares in
+   `Method.tunes` or, if it declares none, two learning rates on either side of the rung. Next to the lowest
+   and the highest rung, one of the two lies outside the ladder: such a method may try 0.0165, which others
+   cannot.
 
-Among the settings that learn at least `LEARNED` of the targets' success the one with the best final average
-wins. A hyper-parameter that the scenario determines, such as the length of a schedule, is fixed: it has the
-same value in all six.
+Among the settings whose success on the targets right after learning is at least `LEARNED`, the one with the
+best final average wins. A hyper-parameter that the scenario determines, such as the length of a schedule, is
+fixed: it has the same value in all six settings.
 """
 
 from __future__ import annotations
@@ -39,11 +41,11 @@ BETWEEN = (0.55, 1.8)
 """Factors of the best rung, for methods without a strength of their own: half a rung down and up."""
 
 LEARNED = 0.8
-"""Least mean success on the targets right after learning them, for a setting that may be chosen."""
+"""Lowest mean success on the targets, right after learning them, with which a setting may be chosen."""
 
 CONTROL_OF = {"constant_weight": "consft_calibrated", "shuffled_weights": "consft_calibrated"}
-"""Controls, with the methods that they differ from in one thing. They have the settings tuned for these, so
-that nothing else differs."""
+"""Controls, each with the method from which it differs in one thing. A control has the settings that were
+tuned for this method, so that nothing else differs."""
 
 Settings = Mapping[str, Any]
 
@@ -86,7 +88,7 @@ def rungs(method: type[Method], fixed: Settings | None = None) -> list[dict[str,
 
 
 def _check_tunes(method: type[Method]) -> None:
-    """Refuse `tunes` that are of no use, before the runs that end with them."""
+    """Refuse unusable `tunes` before the first run, rather than when their turn comes."""
     from clbench.learning.registry import new_method  # imports torch
 
     tried = values_of_strength(method)
@@ -124,8 +126,8 @@ def refinements(method: type[Method], best: Settings) -> list[dict[str, Any]]:
 def best_of(tried: Sequence[Tried]) -> Tried:
     """Return the setting with the best final average among those that learn enough.
 
-    If none learns enough, it is the one that learns most. The first one wins a tie. A setting with a run that
-    failed is not chosen; one at least must have succeeded.
+    If none learns enough, return the one that learns most. The first one wins a tie. A setting with a failed
+    run is not chosen; at least one setting must have none.
     """
     return rated_best(tried)[0]
 
@@ -144,7 +146,7 @@ def tuned_file(table: str) -> Path:
     """Return the path of the file with the settings for a table, which need not exist.
 
     Args:
-        table: The id of a scenario, and the policy if it is another one; see `table_name`.
+        table: The id of a scenario, with the policy if it is not the default one; see `table_name`.
     """
     methods = find_spec("clbench.methods")
     assert methods is not None
@@ -156,8 +158,8 @@ def check_tuned(path: Path, table: str, seeds: Sequence[int], methods: Iterable[
     """Refuse to write the settings of `methods`, tuned on `seeds`, to `path` beside others.
 
     Raises:
-        InputError: The others are of another scenario or policy, or were tuned on other seeds, or the file
-            has no settings.
+        InputError: The other settings are for another scenario or policy, or were tuned on other seeds, or
+            the file has no settings.
     """
     if not path.exists():
         return
@@ -177,7 +179,7 @@ def _settings_in(path: Path) -> dict[str, Any]:
     """Return the content of a file that `write_tuned` wrote.
 
     Raises:
-        InputError: It is another file, or a folder.
+        InputError: The file has other content, or is a folder.
     """
     kinds = {"scenario": str, "seeds": list, "methods": dict}
     try:
@@ -191,10 +193,10 @@ def _settings_in(path: Path) -> dict[str, Any]:
 
 
 def write_tuned(path: Path, table: str, seeds: Sequence[int], methods: Mapping[str, Tuned]) -> None:
-    """Write the settings of `methods` to `path`, and keep those of others that it has already.
+    """Write the settings of `methods` to `path`, and keep the settings of other methods that it has already.
 
     Raises:
-        InputError: `check_tuned` refuses it.
+        InputError: `check_tuned` refuses to write them.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with Lease(path).held():  # another command may add a method at the same time
@@ -203,7 +205,7 @@ def write_tuned(path: Path, table: str, seeds: Sequence[int], methods: Mapping[s
         if path.is_file():
             known = {**_settings_in(path)["methods"], **known}
         content = {"scenario": table, "seeds": list(seeds), "methods": dict(sorted(known.items()))}
-        with replacing(path) as partial:  # a full disk leaves the settings of the others
+        with replacing(path) as partial:  # a full disk must not destroy the settings of the others
             partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     tuned.cache_clear()
 
@@ -220,7 +222,7 @@ def _set_by_tuning(method: type[Method]) -> tuple[str, ...]:
 
 @cache
 def tuned(table: str) -> Mapping[str, Tuned]:
-    """Return what tuning chose for a table, by method; nothing if it was never tuned.
+    """Return what tuning chose for a table, by method; empty if the table was never tuned.
 
     Controls have the settings that were chosen for their methods.
     """
@@ -241,9 +243,9 @@ def tuned_scenarios() -> list[str]:
 
 
 def tuned_settings(table: str, method: str) -> dict[str, Any]:
-    """Return the settings that tuning chose for a method; none if it was not tuned on the scenario.
+    """Return the settings that tuning chose for a method; empty if it was not tuned on the scenario.
 
-    On another policy, a method that was not tuned there has the settings for the usual one.
+    With another policy, a method that was not tuned for it has the settings for the default policy.
     """
     found = tuned(table).get(method) or tuned(table_parts(table)[0]).get(method)
     return dict(found.settings) if found else {}

@@ -17,11 +17,11 @@ _Key = tuple[str, str, int]
 
 
 def check_complete(record: Record, rows: Iterable[EpisodeRow], protocol: Protocol) -> None:
-    """Refuse a record that is not what its budget demands: results that are left out change the scores.
+    """Refuse a record that does not hold what its budget demands: left-out results would change the scores.
 
-    A method of whole stages, and a policy that was trained elsewhere, is evaluated at the ends of stages
-    alone. The latter has no answers and no changes of the policy, and a policy that is not built in may have
-    no answers.
+    A method of whole stages, and a policy that was trained elsewhere, are evaluated only at the ends of
+    stages. A policy that was trained elsewhere has no answers and no changes of the policy, and a policy that
+    is not built in may have no answers.
 
     Args:
         record: The record; its values have been checked one by one.

@@ -9,13 +9,13 @@ from clbench.spec.scenario import Scenario
 
 SEED_DEVIATION = 0.1
 """Standard deviation of a success rate between seeds, assumed where none is measured.
-`docs/guide/statistics.md` has what is measured in the committed records."""
+`docs/guide/statistics.md` has the values measured in the committed records."""
 
 
 def half_width(seeds: int, episodes: int, tasks: int, *, seed_deviation: float = SEED_DEVIATION) -> float:
     """Return half of the expected width of the interval of a mean success rate.
 
-    The rate is assumed to be one half, the worst case. With one seed the interval covers its episodes alone.
+    The rate is assumed to be one half, the worst case. With one seed the interval covers only its episodes.
 
     Args:
         seeds: Number of seeds.
@@ -32,7 +32,7 @@ def half_width(seeds: int, episodes: int, tasks: int, *, seed_deviation: float =
 def episodes_needed(
     wished: float, seeds: int, tasks: int, *, seed_deviation: float = SEED_DEVIATION
 ) -> int | None:
-    """Return the number of episodes of a task for which `half_width` is as `wished`.
+    """Return the number of episodes per task with which `half_width` is as `wished`.
 
     Args:
         wished: Half of the width of the interval, above 0.
@@ -41,14 +41,14 @@ def episodes_needed(
         seed_deviation: Standard deviation of the rate between seeds.
 
     Returns:
-        None if no number of episodes is enough: more seeds are needed.
+        The number, or None if no number of episodes is enough: more seeds are needed.
     """
     if wished >= 0.5:
         return 1  # half of any interval
     of_seeds = seed_deviation**2 if seeds > 1 else 0.0
     error = wished / math.sqrt(1 - 4 * wished**2) / _quantile(seeds)
     of_episodes = seeds * error**2 - of_seeds
-    # A number of episodes that gives the half-width exactly needs no further one.
+    # The margin keeps a number that gives the half-width exactly from being rounded up.
     return math.ceil(0.25 / (tasks * of_episodes) - 1e-6) if of_episodes > 0 else None
 
 
@@ -57,7 +57,7 @@ def _quantile(seeds: int) -> float:
 
 
 def expected_precision(scenario: Scenario, seeds: int) -> str:
-    """Return a sentence on the expected width of the intervals of a run of `scenario`."""
+    """Return a sentence about the expected width of the intervals of a run of `scenario`."""
     episodes = scenario.budget.test_episodes
     retained, target = len(scenario.retained), len(scenario.target)
     counts = {"retention": retained, "adaptation": target, "final average": retained + target}

@@ -21,16 +21,16 @@ from clbench.scoring.scores import rates_of
 
 UNKNOWN_DEVIATION = 0.2
 """Standard deviation between seeds as a share of the range of a metric, assumed where no row has a second
-seed. To be on the safe side it is above the greatest of the final average on the boards, 0.15 (stop_gradient
-on FetchKnowledge-v1). A metric without two bounds then tells no rows apart."""
+seed. To be on the safe side, it is above the greatest deviation of the final average on the boards, 0.15
+(stop_gradient on FetchKnowledge-v1). A metric without two bounds then tells no rows apart."""
 
 
 def deviation_of_differences(metric: str, rows: Iterable[Runs]) -> float | None:
-    """Return the standard deviation of the difference of two rows from seed to seed.
+    """Return the standard deviation, from seed to seed, of the difference between two rows.
 
     It is the root mean square over all pairs of rows, each over its common seeds. With it,
     `student_quantile(n - 1) * deviation / sqrt(n)` is half of the expected width of the interval of one
-    difference over n seeds. To tell two of several rows apart takes more, see `least_difference`.
+    difference over n seeds. Telling two of several rows apart takes more, see `least_difference`.
 
     Args:
         metric: Name of a metric that needs no reference.
@@ -95,21 +95,21 @@ def groups(metric: str, rows: Mapping[str, Runs]) -> dict[str, str]:
 
     A row with the letters "ab" belongs to two groups. It is not told apart from the other members of either,
     but some members of one are told apart from some of the other: similarity is not transitive. Ranks would
-    hide this. They would also depend on noise: of two rows of one value, the noisier one would be like the
-    best row and rank high, the other would not. Here both have the place of their value, and the noisier
-    has more letters.
+    hide this. They would also depend on noise: of two rows with one value, the noisier row would not differ
+    from the best row and would rank high, and the other row would not. Here both are placed by their value,
+    and the noisier row has more letters.
 
-    Rows are compared over their common seeds, which share pretrained policy and initial states. A difference
-    tells them apart if it exceeds the largest of three standard errors, times Tukey's factor for so many
-    rows:
+    Rows are compared over their common seeds, which share the pretrained policy and the initial states. A
+    difference tells two rows apart if it exceeds the largest of three standard errors, times Tukey's factor
+    for this number of rows:
 
     1. from all rows together: the variation of runs around the means of their row and seed. With few seeds
-       it is far more certain than the next, and a row whose runs agree by chance gains nothing;
-    2. from the two rows alone: the variation of their difference between seeds, if there are several. Rows
-       may vary more than others do;
+       this error is far more certain than the next one, and a row whose runs agree by chance gains nothing;
+    2. from the two rows alone: the variation of their difference between seeds, if there are several. Some
+       rows may vary more than others;
     3. from the episodes: the jackknife over them, since all rows may agree by chance.
 
-    So about 5 % of the boards of equal methods have more than one group, and up to 9 % where one method
+    About 5 % of the boards of equal methods thus have more than one group, and up to 9 % where one method
     varies far more than the others: `docs/guide/statistics.md` has the figures. Rows without a common seed
     are compared by the variation of runs around the mean of their row, and so are all rows if no two have
     two common seeds. Where no row has a second seed, a deviation of `UNKNOWN_DEVIATION` is assumed: only
@@ -124,7 +124,7 @@ def groups(metric: str, rows: Mapping[str, Runs]) -> dict[str, str]:
 
     Raises:
         UnknownNameError: The metric is unknown.
-        InputError: It needs a reference or says nothing of better or worse, or the runs are of different
+        InputError: It needs a reference or says nothing about better or worse, or the runs are of different
             tasks, episodes, evaluation points or questions.
     """
     names, board = _board_of(metric, rows)
@@ -155,7 +155,7 @@ def differences_needed(metric: str, rows: Mapping[str, Runs], base: str) -> dict
 
 
 def _board_of(metric: str, rows: Mapping[str, Runs]) -> tuple[list[str], _Board]:
-    """Return the names of the rows with a value, the best first, and what compares them in this order."""
+    """Return the names of the rows with a value, the best first, and a `_Board` that compares them."""
     wanted = load_metric(metric)
     if wanted.higher_is_better is None:
         known = ", ".join(
@@ -215,7 +215,7 @@ def letter_display(apart: NDArray[np.bool_]) -> list[str]:
         for part in (group - {row} for group in split for row in pair):
             if not any(part <= group for group in found):
                 found.append(part)
-    # a to z, and then other small letters: no board has so many groups.
+    # a to z, and then other small letters: no board has that many groups.
     alphabet = filter(str.islower, map(chr, count(ord("a"))))
     named = list(zip(alphabet, sorted(found, key=sorted), strict=False))
     return ["".join(letter for letter, group in named if row in group) for row in range(len(apart))]
@@ -239,7 +239,7 @@ class _Board:
         return found
 
     def compare(self, better: int, worse: int) -> tuple[float, float]:
-        """Return the difference of two rows, and the one beyond which the test tells them apart."""
+        """Return the difference of two rows, and the difference beyond which the test tells them apart."""
         known = np.isfinite(self.values)
         common = known[better] & known[worse]
         number = np.count_nonzero(common)

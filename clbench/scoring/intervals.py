@@ -5,15 +5,16 @@ seed is one whole run, from the pretrained policy to the last stage: its tasks s
 several seeds vary for both reasons. Therefore:
 
 1. With two or more seeds the interval is Student's over the seeds. Its standard error comes from the
-   jackknife, which leaves out one whole seed at a time. Its degrees of freedom are the seeds less one. For a
-   quantity with a least and a greatest value it is Wilson's score interval: see `interval_of_seeds`.
-2. With one seed the variation between seeds is unknown, and the interval covers episodes alone. It holds the
+   jackknife, which leaves out one whole seed at a time. Its degrees of freedom are the number of seeds minus
+   one. If a quantity has a least and a greatest value, the interval is Wilson's score interval: see
+   `interval_of_seeds`.
+2. With one seed the variation between seeds is unknown, and the interval covers only episodes. Its ends are
    percentiles of replicates in which every run keeps its policy and meets episodes drawn with replacement,
    for each task. All stages and evaluation points of a run get the same draws, and so do runs of other
    methods with this seed: they met the same initial states. Fewer episodes are run before the end of a stage.
-   There the rate is the mean over the drawn ones among them. Right answers are drawn from a binomial for each
-   stage and kind of question, since records hold counts only. Such an interval says nothing of other seeds:
-   `Estimate.of_seeds` is False, and nothing is concluded from it.
+   There the rate is the mean over those of them that are drawn. Right answers are drawn from a binomial
+   distribution for each stage and kind of question, since records hold only counts. Such an interval says
+   nothing about other seeds: `Estimate.of_seeds` is False, and nothing is concluded from it.
 3. Where several seeds agree exactly, they may do so by chance. The standard error is then that of these
    replicates, with Student's quantile of the seeds; it is 0 if all outcomes are equal.
 
@@ -64,8 +65,8 @@ OF_WHOLE_RUNS = (
     "met",
     "relearning_steps",
 )
-"""Arrays of `Rates` that no draw of test episodes changes. Unless seeds differ, nothing is known of how much
-they vary: seeds may agree by chance, or at a least value."""
+"""Arrays of `Rates` that no draw of test episodes changes. Unless seeds differ, nothing is known about how
+much they vary: seeds may agree by chance, or at a least value."""
 MANY = 10**6
 """Degrees of freedom of a standard deviation that is known."""
 
@@ -93,7 +94,7 @@ class Estimate:
 
 
 NO_ESTIMATE = Estimate(None, None, None)
-"""What cannot be computed."""
+"""The estimate of a value that cannot be computed."""
 
 
 def row_generator(scenario: str, method: str) -> np.random.Generator:
@@ -114,10 +115,10 @@ def estimate(
 
     Args:
         metrics: Names of metrics.
-        runs: The runs by seed. One seed: the interval is of episodes and answers alone.
+        runs: The runs by seed. With one seed, the interval covers only episodes and answers.
         generator: Source of the draws.
-        references: Runs of reference methods by name and seed. One that lacks a seed of `runs` counts as
-            missing: its metrics have no value.
+        references: Runs of reference methods by name and seed. A reference that lacks a seed of `runs`
+            counts as missing: metrics that need it have no value.
         replicates: Number of draws.
 
     Raises:
@@ -154,7 +155,7 @@ def paired_difference(
 ) -> Estimate:
     """Return the value of `metric` for `runs` minus that for `others`, over the seeds that both have.
 
-    Seeds are left out, and episodes drawn, for both at once, so that difficulty for both cancels. Right
+    Seeds are left out, and episodes drawn, for both at once, so that shared difficulty cancels. Right
     answers are drawn separately, since records do not name the questions: with one seed, intervals of
     differences of answers are a little too wide.
 
@@ -226,9 +227,9 @@ def interval(
         other_episodes: Returns the values with episodes drawn anew, (replicates,). It is called only if the
             seeds do not vary; without it there is then no interval.
         span: Least and greatest possible value.
-        ratio: Whether the values are positive ratios, of which 2 is as far from 1 as 1/2. The interval is
-            then that of their logarithm, and `span` does not count. Values of 0 have no logarithm: with
-            one, the interval is that of the values.
+        ratio: Whether the values are positive ratios, for which 2 is as far from 1 as 1/2. The interval is
+            then computed for their logarithms, and `span` does not count. 0 has no logarithm: if a value is
+            0, the interval is computed for the values themselves.
     """
     if ratio and min([value, *without_one]) > 0:
         found = interval(
@@ -259,7 +260,7 @@ def interval(
 def mean_of_seeds(values: Sequence[float], span: Span, *, ratio: bool = False) -> Estimate:
     """Return the mean of one or more values, one for each seed, with its interval; none with one seed.
 
-    `ratio` is that of `interval`; the mean is then geometric.
+    `ratio` is as for `interval`; with it, the mean is geometric.
     """
     geometric = ratio and min(values) > 0
 
@@ -275,13 +276,14 @@ def mean_of_seeds(values: Sequence[float], span: Span, *, ratio: bool = False) -
 def interval_of_seeds(value: float, error: float, degrees: int, span: Span) -> Span:
     """Return the ends of the interval of a value, given its standard error over seeds.
 
-    Without two bounds it is Student's: the value plus and minus quantile times error. Near a bound Student's
-    interval passes the bound, and it is too short on the other side: if most seeds agree at the bound, their
-    error is small by chance. Between two bounds it is therefore Wilson's score interval, 1927,
-    doi 10.1080/01621459.1927.10502953. It holds each x with |value - x| <= quantile * e(x). The error e(x) is
-    `error` at the value, and its square is proportional to (x - low) (high - x), as for rates. The ends stay
-    inside the span without clipping. Wilson's interval with an error between clusters, here seeds, is
-    recommended by Franco et al. 2019, doi 10.1093/jssam/smy019, after simulations.
+    Without two bounds the interval is Student's: the value plus and minus quantile times error. Near a bound,
+    Student's interval passes the bound, and it is too short on the other side: if most seeds agree at the
+    bound, their error is small by chance. Between two bounds the interval is therefore Wilson's score
+    interval, 1927, doi 10.1080/01621459.1927.10502953. It contains each x with |value - x| <=
+    quantile * e(x). The error e(x) is `error` at the value, and its square is proportional to (x - low)
+    (high - x), as for rates. The ends stay inside the span without clipping. Wilson's interval with an error
+    between clusters, here seeds, is recommended by Franco et al. 2019, doi 10.1093/jssam/smy019, after
+    simulations.
 
     A mean of seeds varies at most as much as one episode: e(x)^2 <= (x - low) (high - x). If the error is
     larger, as that of a metric whose values are cut at a bound may be, the interval is Student's, cut at the
@@ -295,7 +297,7 @@ def interval_of_seeds(value: float, error: float, degrees: int, span: Span) -> S
     """
     low, high = span
     width, reach = high - low, student_quantile(degrees) * error
-    if reach <= 1e-12 * width < math.inf:  # 0 but for the last bits
+    if reach <= 1e-12 * width < math.inf:  # 0 except for the last bits
         return value, value
     place = min(max((value - low) / width, 0.0), 1.0)
     spread = place * (1 - place)
@@ -360,7 +362,7 @@ class _Samples:
         check_same(run.layout for runs in every for run in runs)
 
     def estimate(self, quantity: _Quantity, span: Span, *, ratio: bool = False) -> Estimate:
-        """Return a quantity with its interval; `ratio` is that of `interval`."""
+        """Return a quantity with its interval; `ratio` is as for `interval`."""
         return interval(
             float(quantity(self.whole)),
             quantity(self.without_one) if len(self.methods[0]) > 1 else np.zeros(0),

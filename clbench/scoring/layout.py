@@ -28,8 +28,8 @@ class Layout:
     curve_episodes: tuple[int, ...]
     """Numbers of the scored episodes that are also run before the end of a stage, rising."""
     validation_episodes: tuple[int, ...]
-    """Numbers of the validation episodes on a stage's target, rising. No metric reads them; runs that had
-    others do not combine."""
+    """Numbers of the validation episodes on a stage's target, rising. No metric reads them; runs with
+    other validation episodes do not combine."""
     steps: tuple[int, ...]
     """Steps of a stage after which the policy is evaluated, rising, above 0; the last one is the stage's
     end."""

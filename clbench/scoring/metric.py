@@ -18,7 +18,7 @@ from clbench.scoring.rates import Rates
 Function = Callable[[Rates], Array]
 
 DIFFERENCE = "difference of success rates"
-"""Unit of a metric that takes success rates from each other."""
+"""Unit of a metric that subtracts success rates from each other."""
 
 TIE = 1e-9
 """Greatest difference of equal values: quotients of whole numbers may differ in the last bit."""
@@ -42,13 +42,13 @@ class Facts:
     high: float = 1.0
     """Greatest possible value."""
     higher_is_better: bool | None = True
-    """None if neither is better."""
+    """Whether a higher value is better; None if neither is."""
     units: str = "success rate"
     """Unit of the value."""
     references: tuple[str, ...] = ()
     """Methods whose records of the same seeds it needs."""
     compares_itself: bool = False
-    """Whether a reference method has a value too, compared with itself."""
+    """Whether a reference method also has a value, compared with itself."""
     pooled: bool = False
     """Whether the rates are averaged over seeds first; if not, the value is the mean of the seeds' values."""
     ratio: bool = False

@@ -54,15 +54,15 @@ USUAL_NAMES: Mapping[str, tuple[str, ...]] = {
     "rem": ("remembering_diaz_rodriguez",),
     "zs": ("zero_shot",),
 }
-"""Names that papers use, in small letters, with the metrics that they may mean."""
+"""Names that papers use, in lower case, with the metrics that they may mean."""
 
 
 def load_metric(name: str) -> Metric:
     """Return the metric with this name, with this title on the board, or with this name in papers.
 
     Raises:
-        UnknownNameError: No metric has this name, and the message names the nearest one; or papers give the
-            name to several, and it names them.
+        UnknownNameError: No metric has this name, and the message names the nearest one; or papers use the
+            name for several metrics, and the message names them.
     """
     titles = {title.replace(" ", "_"): one for one, title in TITLES.items()}
     wanted = name.replace(" ", "_")

@@ -1,9 +1,9 @@
 """Metrics as other benchmarks, papers and libraries define them.
 
 One word has many meanings in this field: here each definition carries the name of its source. As published,
-they cover the sequence of learned tasks: the targets, without the retained skills and the held-out tasks.
-R[l][k] is the success on target k at the end of stage l, and K is the last stage. Between the ends of the
-stages only the current target is known, so that earlier and later targets count at the ends only.
+the metrics cover the sequence of learned tasks: the targets, without the retained skills and the held-out
+tasks. R[l][k] is the success on target k at the end of stage l, and K is the last stage. Between the ends of
+the stages only the current target is known, so that earlier and later targets count only at the ends.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def _weighted(values: Array, weights: Array) -> Array:
 
 
 def _mean(values: Array, chosen: Array) -> Array:
-    """Return the mean of values (..., n, n) where chosen (n, n) is 1, NaN if it is nowhere."""
+    """Return the mean of values (..., n, n) where chosen (n, n) is 1, NaN if it is 1 nowhere."""
     return _weighted(values, chosen / max(chosen.sum(), 1.0))
 
 

@@ -31,7 +31,7 @@ class Measured:
     shift: Array
     """Change of the policy on each stage's target in the stage, (..., targets)."""
     captured: Array
-    """Share of episodes after each stage that do its target though asked for a skill, (..., targets)."""
+    """Share of episodes after each stage in which its target is done instead of a skill, (..., targets)."""
     steps: Array
     """Optimiser steps to the criterion, all of the budget if never met, (..., targets); NaN without one."""
     met: Array
@@ -94,7 +94,7 @@ class Rates(Measured):
 
     @property
     def have_curves(self) -> bool:
-        """Whether stages have learning curves: those to a criterion have their end alone."""
+        """Whether stages have learning curves: with a criterion, only the end of a stage is evaluated."""
         return not self.layout.to_criterion
 
     @property
@@ -116,13 +116,13 @@ class Rates(Measured):
 
     def mean_over_runs(self) -> Rates:
         """Return rates averaged over the last batch axis, the runs: (..., runs) becomes (...)."""
-        # counted from the front: behind the batch axes some arrays have two axes and some have three
+        # counted from the front: after the batch axes some arrays have two axes and some have three
         axis = self.success.ndim - 3
         return self.each(lambda array: np.mean(array, axis=axis))
 
 
 def stacked(rates: Sequence[Rates], axis: int = 0) -> Rates:
-    """Return rates of one layout as one, along a new batch axis; references stay behind."""
+    """Return rates with one layout as one, along a new batch axis and without their references."""
     joined: dict[str, Any] = {
         name: np.stack([getattr(part, name) for part in rates], axis) for name in _arrays(Rates)
     }

@@ -14,13 +14,13 @@ from clbench.scoring.layout import Array
 from clbench.spec.protocol import SPLITS, Point, Protocol, check_steps
 
 MOST = 10**9
-"""More steps, episodes or questions than any run has: a number beyond it is damage."""
+"""More steps, episodes or questions than any run has: a larger number is a sign of damage."""
 
 MOST_POINTS = 100
-"""Evaluation points of a stage."""
+"""Most evaluation points of a stage."""
 
 MOST_CELLS = 20_000
-"""Cells of a table of rates, for example stages x points x tasks: 2,000 replicates of it take 320 MB.
+"""Most cells of a table of rates, for example stages x points x tasks: 2,000 replicates of it take 320 MB.
 Fetch-v1 has 240, a sequence of 40 targets among 50 tasks 8,200."""
 
 _HIGHEST = {"update_sparsity": 1.0, "activation_drift": FARTHEST, "shift": FARTHEST, "captured": 1.0}
@@ -110,8 +110,8 @@ def _read_ends(record: Record) -> tuple[int, ...]:
 def read_checks(record: Record, protocol: Protocol) -> tuple[Array, Array]:
     """Return the steps to the criterion of each stage, and whether it was met, (targets,); NaN without one.
 
-    A stage that never met it counts as the full budget of steps, also that of a method that trains nothing
-    and is checked once.
+    A stage that never met it counts as the full budget of steps, even for a method that trains nothing and is
+    checked once.
     """
     ends = dict.fromkeys(protocol.stages[1:], (math.nan, math.nan))
     for row in record.check_rows():
@@ -164,7 +164,7 @@ def check_cells(what: str, *sizes: int) -> None:
 
 
 def place(protocol: Protocol, point: Point) -> int:
-    """Return the index of a point among the evaluation steps; one that ends a stage may have index -1."""
+    """Return the index of a point among the evaluation steps; the end of a stage may have index -1."""
     return protocol.steps.index(point.step) if point.stage and protocol.ends is None else -1
 
 
@@ -229,7 +229,7 @@ def _check_kinds(protocol: Protocol, rows: Iterable[EpisodeRow]) -> None:
 def read_perturbed(
     protocol: Protocol, rows: Iterable[EpisodeRow], episodes: Iterable[int]
 ) -> list[EpisodeRow]:
-    """Return the perturbed episodes among `rows`: all that the protocol demands, and no other.
+    """Return the perturbed episodes among `rows`: all that the protocol demands, and no others.
 
     Args:
         protocol: Protocol of the run.

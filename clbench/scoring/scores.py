@@ -40,7 +40,7 @@ WEAK_WARNING = (
 class Scores(Measured):
     """The outcomes in a record as arrays, NaN where missing. The success of an episode is 0 or 1.
 
-    The scored episodes are the test episodes, in a tuning run the validation episodes.
+    The scored episodes are the test episodes or, in a tuning run, the validation episodes.
     """
 
     success: Array
@@ -56,8 +56,8 @@ class Scores(Measured):
 
         Args:
             record: A record.
-            partial: Accept a record that lacks some of the results that its budget demands; metrics that need
-                them have no value.
+            partial: Whether to accept a record that lacks some of the results that its budget demands;
+                metrics that need them then have no value.
 
         Raises:
             RecordError: The record contradicts itself: impossible tasks, stages, steps or values, or results
@@ -72,7 +72,7 @@ class Scores(Measured):
         scored = [row for row in rows if row.split == protocol.split]
         on_the_way = [row for row in scored if not protocol.is_end(row.point)]
         episodes = numbers(scored)
-        # a method that is evaluated at the ends alone has none, and belongs to the others all the same
+        # a method that is evaluated only at the ends has none, and must still combine with the others
         count = protocol.scored_episodes(at_end=False)
         planned = episodes if protocol.split == "validation" else tuple(n for n in episodes if n < count)
         layout = Layout(
@@ -123,7 +123,7 @@ class Scores(Measured):
 
     @cached_property
     def _plain_rates(self) -> Rates:
-        """The rates that every comparison of the run needs again: a board asks for them 50 times."""
+        """The rates that every comparison of the run needs; a board asks for them 50 times."""
         return self._rates(np.ones((len(self.layout.tasks), len(self.layout.episodes))))
 
     def _rates(self, counts: Array) -> Rates:
@@ -133,7 +133,7 @@ class Scores(Measured):
             return np.broadcast_to(array, batch + array.shape)
 
         success = _sums(self.success, counts) / number
-        if np.isnan(self.perturbed).all():  # most runs have none, and to count them takes long
+        if np.isnan(self.perturbed).all():  # most runs have none, and counting them takes long
             perturbed = spread(np.full(self.perturbed.shape[:-1], np.nan))
         else:
             perturbed = _sums(self.perturbed, counts) / number
@@ -155,13 +155,13 @@ class Scores(Measured):
 
 
 def _chosen_on(rows: Sequence[EpisodeRow], protocol: Protocol) -> list[EpisodeRow]:
-    """Return the validation episodes of each stage's target, which choices may look at."""
+    """Return the validation episodes of each stage's target, on which choices may be based."""
     own = [row for row in rows if row.split == "validation" and row.stage > 0]
     return [row for row in own if row.task == protocol.target[row.stage - 1]]
 
 
 def _sums(values: Array, counts: Array) -> Array:
-    """Return the sums of values (..., tasks, episodes) over episodes, each as often as it counts.
+    """Return the sums of values (..., tasks, episodes) over episodes, each weighted by its count.
 
     Args:
         values: Values, (*shape, tasks, episodes).
@@ -195,7 +195,7 @@ def _success(protocol: Protocol, rows: Sequence[EpisodeRow], layout: Layout) -> 
 
 
 def _shares(asked: Array, correct: Array) -> Array:
-    """Return the share of correct answers (...) of counts (..., kinds), NaN where a kind was not asked."""
+    """Return the share of correct answers (...) from counts (..., kinds), NaN if a kind was not asked."""
     complete = (asked > 0).all(axis=-1) & (asked.sum(axis=-1) > 0)
     return np.where(complete, correct.sum(axis=-1) / np.maximum(asked.sum(axis=-1), 1), np.nan)
 

@@ -3,13 +3,13 @@
     python docs/guide/online_sac.py clbench/PointMaze-v1 --seeds 3
     python docs/guide/online_sac.py clbench/PointMaze-v1 --seeds 3 --replay
 
-SAC continues to train from task to task, and acts in eight environments at once. `SETTINGS` has what differs
-from the defaults of Stable-Baselines3 on a scenario. So that it explores again, each stage begins with the
-entropy coefficient at 1, and its first twentieth of steps is random. The replay buffer is emptied at each
-stage, so that only the weights remember; with --replay it keeps the transitions of all stages. Word ids are
-names, not amounts, and go through an embedding; pictures go through a convolutional network. A seed that has
-a record is skipped; a seed that was stopped starts again.
-The same seed repeats itself on the same machine.
+SAC continues to train from task to task, and acts in eight environments at once. `USUAL` has what differs
+from the defaults of Stable-Baselines3, and `SETTINGS` what differs from both on a scenario. Each stage begins
+with the entropy coefficient at 1 and with a twentieth of its steps at random, so that SAC explores again. The
+replay buffer is emptied at each stage, so that only the weights remember; with --replay it keeps the
+transitions of all stages. Word ids are names, not amounts, and go through an embedding; pictures go through a
+convolutional network. A seed that has a record is skipped; a seed that was stopped starts again. On the same
+machine, the same seed gives the same result.
 """
 
 from __future__ import annotations

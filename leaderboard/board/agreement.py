@@ -1,4 +1,4 @@
-"""Agreement on the order of the rows: of two boards, Kendall's tau; of the seeds of one, Kendall's W."""
+"""Agreement on the order of the rows: Kendall's tau of two boards, Kendall's W of the seeds of one."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ ORDERS = 20_000
 """Random orders of the rows in Kendall's test where rows tie: p is known to 0.002 at 0.05."""
 
 SIGNIFICANCE = 0.05
-"""Largest probability of an agreement that is not put down to chance."""
+"""Probability by chance below which an agreement is not attributed to chance."""
 
 LEAST_SEEDS, LEAST_ROWS = 4, 6
-"""Fewest seeds of a board and rows: Friedman's test and draws of seeds assume some seeds, and five rows have
-few orders."""
+"""Fewest seeds and rows of a board: Friedman's test and draws of seeds assume several seeds, and five rows
+have few orders."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Concordance:
     w: float
     """1 if all seeds have the same order, 0 if the sums of the ranks are equal."""
     chance: float
-    """Probability of a W as large if each seed had the rows in a random order (Friedman's test)."""
+    """Probability of a W at least as large if each seed had a random order of the rows (Friedman's test)."""
     seeds: int
     """Number of seeds."""
     rows: int
@@ -37,24 +37,25 @@ class Concordance:
 
     @property
     def certain(self) -> bool:
-        """Whether chance does not explain it."""
+        """Whether chance is too unlikely to explain the agreement."""
         return self.chance < SIGNIFICANCE
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Kendall's tau between the orders of rows by two boards, with its range over redrawn seeds.
+    """Kendall's tau between the orders of the rows on two boards, with its range over redrawn seeds.
 
-    The range is no confidence interval of the true tau. Redrawn seeds add noise to noisy means, which pulls
-    tau towards 0: in simulations with 12 methods, the range had the true tau in 47 to 86 % of the boards.
+    The range is not a confidence interval of the true tau. Redrawn seeds add noise to noisy means, which
+    pulls tau towards 0: in simulations with 12 methods, the range contained the true tau on 47 to 86 % of the
+    boards.
     """
 
     tau: float
     """Kendall's tau: 1 for equal orders, -1 for opposite ones."""
     low: float
-    """Lower end of the range that has 95 % of the redrawn boards."""
+    """Lower end of the range that contains 95 % of the redrawn boards."""
     high: float
-    """Its upper end."""
+    """Upper end of the range."""
     seeds: int
     """Number of seeds in both boards together."""
     rows: int
@@ -83,10 +84,10 @@ def kendall_tau(one: Array, other: Array) -> Array:
 
 
 def chance_of(one: Array, other: Array) -> float:
-    """Return the two-sided probability of Kendall's test that values (rows,) and others are unrelated.
+    """Return the two-sided p-value of Kendall's test that values (rows,) and others are unrelated.
 
-    Without ties it is exact. With ties SciPy has only the normal approximation, which gave 0.11 and 0.28 for
-    10 rows where 40,000 random orders gave 0.13 and 0.33; random orders then stand for all.
+    Without ties it is exact. With ties, SciPy has only the normal approximation: for 10 rows, this gave 0.11
+    and 0.28 where 40,000 random orders gave 0.13 and 0.33. Random orders then stand in for all orders.
     """
     from scipy.stats import kendalltau, permutation_test  # a second, which reading a board does not need
 
@@ -128,7 +129,7 @@ def concordance(values: Array) -> Concordance | None:
 
 
 def agreement_between(one: Array, other: Array, replicates: int = REPLICATES) -> Agreement | None:
-    """Return the agreement of two boards of different runs on the order of the same rows.
+    """Return how far two boards of different runs agree on the order of the same rows.
 
     The range holds the percentiles of `replicates` pairs of boards whose seeds are drawn with replacement, in
     each board on its own; all rows share the draws, since seeds differ a lot. Two metrics of the same runs
@@ -136,7 +137,7 @@ def agreement_between(one: Array, other: Array, replicates: int = REPLICATES) ->
 
     Args:
         one: Value of each row and seed, (rows, seeds).
-        other: The same of the other board, (rows, other seeds).
+        other: The same for the other board, (rows, other seeds).
         replicates: Number of draws.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The commands that make records, as pages and the terminal name them."""
+"""The commands that make records, as pages and the terminal show them."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def run_command(scenario: str, *labels: str, records: Path = RECORDS) -> str:
 
 
 def commands_of(runs: Iterable[Run]) -> list[str]:
-    """Return the commands that make the records of runs of one row again, quoted for the shell.
+    """Return the commands that make the records of one row's runs again, quoted for the shell.
 
-    A stranger may have written the records.
+    The quoting matters because a stranger may have written the records.
     """
     lines = []
     for (device, perturb), members in groupby(runs, key=_how):

@@ -21,7 +21,7 @@ def step_ratio(run: Run) -> float | None:
 
 
 def mean_step_ratio(runs: Sequence[Run]) -> float | None:
-    """Return the geometric mean of `step_ratio` over the runs that measured it, None without one."""
+    """Return the geometric mean of `step_ratio` over the runs that measured it, None if none did."""
     known = [ratio for ratio in map(step_ratio, runs) if ratio is not None]
     return statistics.geometric_mean(known) if known else None
 
@@ -30,13 +30,13 @@ def costs_of(runs: Sequence[Run], baseline: Sequence[Run]) -> dict[str, float | 
     """Return the costs of the runs of a method, each a mean over seeds.
 
     `relative_cost` is the time of all optimiser steps, preparation included, divided by the baseline's: the
-    ratio of the steps times the ratio of the time of one, which each run measures on its own machine. It is
-    None where no run measured it, unless the method takes no steps.
+    ratio of the steps times the ratio of the time of a step, which each run measures on its own machine. It
+    is None where no run measured it, unless the method takes no steps.
 
     Args:
         runs: Runs of the method.
         baseline: Runs of plain fine-tuning on the same scenario; may be empty. The relative cost compares the
-            seeds that both have; it is None without one.
+            seeds that both have; it is None if there are none.
     """
     costs = {column: _mean(runs, name) for column, name in COSTS.items()}
     common = {run.seed for run in runs} & {run.seed for run in baseline}

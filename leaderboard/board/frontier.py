@@ -1,7 +1,7 @@
 """The frontier: what methods learn and keep at each learning rate of the ladder.
 
-The ladder also has plain fine-tuning at settings that tuning rated as highly as the chosen one. A gain over
-the chosen one alone may come from the order in which tuning tried them.
+The ladder also has plain fine-tuning at settings that tuning rated as highly as the chosen one. Without them,
+a gain over the chosen setting may come from the order in which tuning tried the settings.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Curve:
     """One method along the ladder."""
 
     method: str
-    """Name of the method; with its other changed settings if the ladder has several of it."""
+    """Name of the method, with its other changed settings if the ladder has several of these."""
     division: str
     """One of `DIVISIONS`."""
     rungs: tuple[Rung, ...]
@@ -66,9 +66,9 @@ def ladder_of(records: Path) -> Path:
 
 
 def read_ladder(folder: Path, board: Iterable[Run] = ()) -> Sifted:
-    """Return the runs of the ladder below `folder` by scenario, and the files that are no such run.
+    """Return the runs of the ladder below `folder`, sorted by scenario, and the files that are no such run.
 
-    Their paths begin with the folder's name. A missing folder counts as empty.
+    The paths of these files begin with the folder's name. A missing folder counts as empty.
 
     Args:
         folder: The folder.
@@ -99,7 +99,7 @@ def like_the_board(board: Iterable[Run]) -> Sift:
 
 
 def frontiers_of(ladder: Sequence[Run]) -> dict[str, tuple[Curve, ...]]:
-    """Return the curves of runs that `read_ladder` returned by scenario, plain fine-tuning first.
+    """Return the curves by scenario, plain fine-tuning first, of runs that `read_ladder` returned.
 
     A scenario with one learning rate has no curves: its runs are for the claims.
     """
@@ -164,7 +164,7 @@ class TiedGain:
     factor: float
     """Step factor of plain fine-tuning."""
     gain: Estimate
-    """Difference in final average, over the common seeds; missing without one."""
+    """Difference in final average, over the common seeds; missing if there are none."""
     seeds: int
     """Number of common seeds."""
 
@@ -193,7 +193,7 @@ def tied_gains(
     """Return the gains of methods over plain fine-tuning at each tied setting, from runs of the ladder.
 
     Args:
-        scenario: Name of the table: the scenario, and the policy if it is another one.
+        scenario: Name of the table: the scenario, with the policy if it is not the default one.
         methods: Scores by method and seed.
         ladder: Runs of the ladder, of any scenario and method.
     """

@@ -10,7 +10,7 @@ from clbench.scoring.metrics import measure
 from .runs import Run, mean_of
 
 LEAST_ORDERS = 3
-"""Fewest orders for a range; over fewer it means little."""
+"""Fewest orders for a range; a range over fewer orders means little."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Orders:
 
     @property
     def sensitivity(self) -> float | None:
-        """Greatest less least final average; None with fewer than `LEAST_ORDERS`, or if one is missing."""
+        """Greatest minus least final average; None with fewer than `LEAST_ORDERS`, or if one is missing."""
         values = [order.final_average for order in self.orders if order.final_average is not None]
         if len(values) < max(LEAST_ORDERS, len(self.orders)):
             return None

@@ -24,7 +24,7 @@ class OverallRow:
     division: str
     """One of `DIVISIONS`."""
     scenarios: tuple[str, ...]
-    """Names of the tables that it is the mean of, in the order of the board."""
+    """Names of the tables that it averages, in the order of the board."""
     letters: tuple[str | None, ...]
     """Letters of its groups in the scenarios, in the order of the board; None where it has no rival."""
     estimates: Mapping[str, Estimate]
@@ -36,7 +36,7 @@ class OverallRow:
 def overall(rows: Iterable[RowSummary]) -> tuple[OverallRow, ...]:
     """Return a row for each method that has one in every scenario, by division and falling final average.
 
-    There is none if there is only one scenario. Rows of other policies than the usual one do not count.
+    There are no rows if there is only one scenario. Only rows of the default policy count.
     """
     by_method: dict[tuple[str, str], dict[str, RowSummary]] = {}
     tables = tables_of(row for row in rows if table_parts(row.scenario)[1] == DEFAULT_POLICY)
@@ -68,11 +68,12 @@ def _overall_row(found: Mapping[str, RowSummary], tables: Mapping[str, Sequence[
 
 
 def mean_estimate(parts: Sequence[Estimate]) -> Estimate:
-    """Return the mean of independent estimates; a missing one leaves none.
+    """Return the mean of independent estimates; if one is missing, there is no mean.
 
     The interval is recovered from the parts' intervals, whose distances from their values add up in squares:
-    Zou and Donner 2008, doi 10.1002/sim.3095 (MOVER). Two scenarios with tasks in common, as Fetch-v1 and
-    FetchKnowledge-v1, share demonstrations and initial states: that is as little covered as in one scenario.
+    Zou and Donner 2008, doi 10.1002/sim.3095 (MOVER). Two scenarios with tasks in common, such as Fetch-v1
+    and FetchKnowledge-v1, share demonstrations and initial states. The interval does not cover that, nor does
+    the interval of a single scenario.
     """
     values = [one.value for one in parts if one.value is not None]
     if not values or len(values) < len(parts):

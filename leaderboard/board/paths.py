@@ -1,4 +1,4 @@
-"""Places that commands and pages of the leaderboard know, most of them relative to the working directory."""
+"""Paths that the leaderboard's commands and pages use, most of them relative to the working directory."""
 
 from __future__ import annotations
 
@@ -22,5 +22,5 @@ FILM = "film.gif"
 
 
 def beside(records: Path, name: str) -> Path:
-    """Return the path of a folder beside a folder of records; a link counts where it lies."""
+    """Return the path of a folder beside a folder of records, without following a link."""
     return Path(os.path.normpath(records.absolute() / ".." / name))

@@ -17,11 +17,11 @@ PREDICTORS = {
     "the share of the weights that changed": ("update_sparsity", -1.0),
     "activation drift": ("activation_drift", 1.0),
 }
-"""Metrics that may predict what a run forgets, and whether they rise or fall with it, by their names in a
-sentence."""
+"""Metrics that may predict what a run forgets, by their names in a sentence; 1 if they rise with forgetting,
+-1 if they fall."""
 
 BOARDS = 10_000
-"""Boards of equal methods that say how large a tau is by chance; no p is below 0.0001."""
+"""Number of boards of equal methods that show how large a tau is by chance; no p is below 0.0001."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Prediction(Agreement):
     """Kendall's tau between a predictor and forgetting over the methods, with its range over drawn seeds."""
 
     predictor: str
-    """Its name in a sentence: a key of `PREDICTORS`."""
+    """Name of the predictor in a sentence: a key of `PREDICTORS`."""
 
 
 def predictions(rows: Iterable[Row]) -> list[Prediction]:
@@ -74,11 +74,11 @@ def prediction_of(name: str, values: Array, replicates: int = REPLICATES) -> Pre
 
 
 def chance_among_equals(tau: float, values: Array, boards: int = BOARDS) -> float:
-    """Return the probability of a tau as large as this, of either sign, if all methods were equal.
+    """Return the probability of a tau at least as large, of either sign, if all methods were equal.
 
     Both quantities come from the same runs, so their noise correlates, and Kendall's own test finds an order
-    among equal methods. Here the noise of a row is its residual after the means of rows and seeds. It is
-    resampled by seed with replacement, for both quantities together.
+    among equal methods. Here the noise of a row is what remains without the means of rows and seeds. It
+    is resampled by seed with replacement, for both quantities together.
 
     Args:
         tau: Kendall's tau of the board.

@@ -1,6 +1,6 @@
 """Rows of the leaderboard, one for each method and scenario, in the order of the table.
 
-They are made from the records alone.
+They are made only from the records.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ class Row(RowSummary):
     """One method on one scenario, with its records."""
 
     runs: tuple[Run, ...]
-    """Its runs with the targets in the published order, by rising seed. All but `orders` is made from
+    """Its runs with the targets in the published order, by rising seed. Everything but `orders` is made from
     them."""
     orders: Orders
     """Its results with the targets in this and in other orders."""
     height: float | None
-    """What orders the rows of a division, higher first, see `_heights`; None without a final average."""
+    """Value that orders the rows of a division, higher first: `_heights`; None without a final average."""
 
     @property
     def scores(self) -> Runs:
@@ -70,10 +70,10 @@ class Board(Summary):
     """`Record.scenario`, which the rows of a scenario share, by its id."""
     rows: tuple[Row, ...] = ()
     frontiers: Mapping[str, tuple[Curve, ...]] = field(default_factory=dict)
-    """Methods at the learning rates of the ladder, by scenario; those with records only."""
+    """Methods at the learning rates of the ladder, by scenario; only scenarios with records."""
     tied: Mapping[str, Mapping[str, tuple[TiedGain, ...]]] = field(default_factory=dict)
     """Gains over plain fine-tuning at settings that tuning rated as highly as the chosen one, by scenario and
-    method; of a scenario without such a setting, none."""
+    method; empty for a scenario without such a setting."""
 
 
 def compute_board(records: Path, only: Container[str] | None = None) -> Board:
@@ -81,7 +81,7 @@ def compute_board(records: Path, only: Container[str] | None = None) -> Board:
 
     Args:
         records: Folder of the records.
-        only: Paths of the records that count, from the folder; None for all.
+        only: Paths of the records that count, relative to the folder; None for all.
 
     Raises:
         NoRecordsError: The folder does not exist.
@@ -206,7 +206,7 @@ def unpaired(rows: Iterable[Row]) -> dict[str, list[int]]:
 
 
 def mean_difference(metric: str, runs: Runs, others: Runs) -> float | None:
-    """Return the mean over the common seeds of a metric of `runs` minus that of `others`; None without one.
+    """Return a metric of `runs` minus that of `others`, averaged over the common seeds; None without any.
 
     Args:
         metric: Name of a metric that needs no reference.
@@ -223,11 +223,11 @@ def mean_difference(metric: str, runs: Runs, others: Runs) -> float | None:
 def _heights(
     finals: Mapping[str, float | None], rows: Mapping[str, Runs], baseline: Runs
 ) -> dict[str, float | None]:
-    """Return what orders the rows of a division, by method; None without a final average.
+    """Return the values that order the rows of a division, by method; None without a final average.
 
-    It is the final average minus that of plain fine-tuning over the seeds that both have: seeds differ so
-    much that the final averages of different seeds say little. A row that shares no seed with plain
-    fine-tuning has None beside rows that do; if none does, it is the final average for all of them.
+    The value is the final average minus that of plain fine-tuning over the seeds that both have: seeds differ
+    so much that final averages over different seeds say little. A row that shares no seed with plain
+    fine-tuning has None if other rows share one; if none does, the value is the final average for all rows.
     """
     known = [method for method, final in finals.items() if final is not None]
     gains = {method: mean_difference(RANKED_BY, rows[method], baseline) for method in known}
@@ -246,7 +246,7 @@ def _estimates(method: str, by_method: Mapping[str, list[Run]]) -> dict[str, Est
         name for metric in METRICS.values() if not metric.compares_itself for name in metric.references
     }
     runs = by_method[method]
-    # A reference is compared with itself only where that means something, an agent with none.
+    # A reference is compared with itself only where that means something; an agent is compared with none.
     references = {
         name: _scores(them)
         for name, them in by_method.items()
@@ -285,9 +285,9 @@ def standing_of(row: Row, rows: Iterable[Row]) -> Standing | None:
 def apart_from_baseline(rows: Iterable[Row]) -> frozenset[str]:
     """Return the methods of a scenario that the test of `groups` tells apart from plain fine-tuning.
 
-    Each is tested together with plain fine-tuning and all others that may look at as much: at prior
-    demonstrations, or at none. The interval of one gain alone does not count how many methods were compared.
-    A row without a final average is not told apart from any.
+    Each method is tested together with plain fine-tuning and all methods with the same access: those that may
+    read prior demonstrations, or those that may not. The interval of one gain alone does not account for the
+    number of methods that were compared. A row without a final average is told apart from none.
     """
     members = list(rows)
     apart: set[str] = set()
@@ -339,7 +339,7 @@ def values_by_seed(rows: Iterable[Row], metric: str = RANKED_BY) -> dict[str, li
     """Return a metric of each competing row with each of the baseline's seeds, by method.
 
     Rows that lack one of these seeds, or a value, are left out. So are controls: each is a method of the
-    board with one thing changed, and would count as one more method. There is none without the baseline.
+    board with one thing changed, and would count as one more method. Without the baseline, there is none.
 
     Args:
         rows: Rows of a scenario.

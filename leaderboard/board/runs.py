@@ -39,13 +39,13 @@ class Run:
     """A record that may become part of a row."""
 
     path: str
-    """Path of its record from the folder of records."""
+    """Path of its record, relative to the folder of records."""
     record: Record
     """The record."""
     scores: Scores
     """Scores of the record."""
     table: str
-    """Table that it belongs to: the scenario, and the policy if it is another one; see `table_name`."""
+    """Table of the run: the scenario, with the policy if it is not the default one; see `table_name`."""
     method: str
     """The method with its changed hyper-parameters, see `label_of`."""
     seed: int
@@ -80,8 +80,8 @@ def read_runs(
     Args:
         folder: Folder of the records.
         read: Reads one record below a folder.
-        sifts: What is asked of the runs together.
-        only: Paths of the files that are read, from the folder; None for all.
+        sifts: Functions that keep the runs that may be compared.
+        only: Paths of the files to read, relative to the folder; None for all.
     """
     runs: list[Run] = []
     refused: list[NotShown] = []
@@ -116,7 +116,7 @@ def read_run(folder: Path, path: Path, changed: bool | None = False) -> Run:
     Args:
         folder: Folder of the records.
         path: Path of the file.
-        changed: Whether its settings must have been changed; None if they may.
+        changed: Whether its settings must be changed; None if they may or may not be.
 
     Raises:
         RecordError: It cannot be read, its run failed or is of another kind, or it contradicts itself.
@@ -164,7 +164,7 @@ def _published(record: Record) -> ScenarioInfo:
 
 
 def _check_settings(run: RunInfo) -> None:
-    """Refuse impossible settings: a built-in method has its defaults, but for the changes."""
+    """Refuse impossible settings: a built-in method has its defaults, except for the changes."""
     method, settings, changes = run.method, run.settings, run.changes
     lost = [name for name in changes if name not in settings or settings[name] != changes[name]]
     if lost:
@@ -214,7 +214,7 @@ def division_of(uses: dict[str, Any]) -> str:
     """Return the division of a method that declares `uses`.
 
     Raises:
-        RecordError: `uses` is no valid declaration.
+        RecordError: `uses` is not a valid declaration.
     """
     kinds = ("demonstrations", "questions")
     if "external" in uses:
@@ -239,7 +239,7 @@ def division_of(uses: dict[str, Any]) -> str:
 
 
 def no_row(path: str, reason: str) -> NotShown:
-    """Return a file that makes no row, with printable texts of limited length."""
+    """Return the entry of a file that makes no row, with printable texts of limited length."""
     reason = printable(reason)
     reason = reason if len(reason) <= LONGEST_REASON else f"{reason[:LONGEST_REASON]}…"
     return NotShown(printable(path), reason)
@@ -258,7 +258,7 @@ def sift_by(runs: Iterable[Run], fault: Callable[[Run], str]) -> Sifted:
 
 
 def same_scenario(runs: list[Run]) -> Sifted:
-    """Keep the runs whose scenario is the usual one, targets compared in their published order."""
+    """Keep the runs whose scenario is the usual one; targets are compared in the published order."""
 
     def reason(run: Run, other: Run) -> str:
         fields = differences(vars(run.published), vars(other.published))
@@ -286,9 +286,9 @@ def same_simulator(runs: list[Run]) -> Sifted:
 def same_definition(runs: list[Run]) -> Sifted:
     """Keep the runs whose scenario is defined as here, or, if it is not the project's, as in most records.
 
-    Worlds move otherwise on ARM: without a run of the pinned definition, a table's runs of ARM are compared
-    with one another, and with the pin in what depends on no processor. A record is kept if it is older than
-    definitions, or than the parts of `LATER` in which it would differ.
+    Worlds move differently on ARM. If a table has no run of the pinned definition, its runs of ARM are
+    compared with one another, and with the pin in the parts that depend on no processor. A record is kept if
+    it is older than definitions, or than the parts of `LATER` in which it would differ.
     """
     ours = [run for run in runs if run.record.run.scenario in pinned()]
     fitting = {run.table for run in ours if not unlike_the_pin(run)}
@@ -301,9 +301,9 @@ def same_definition(runs: list[Run]) -> Sifted:
 
 
 def unlike_the_pin(run: Run, moves: bool = False) -> str:
-    """Return in which parts the definition of a run of the project's scenarios is not the pinned one.
+    """Return in words where the definition of a run differs from the pinned one; empty if it does not.
 
-    If its worlds may move otherwise (`moves`), tasks and questions do not count: they come from episodes.
+    If its worlds may move differently (`moves`), tasks and questions do not count: they come from episodes.
     """
     scenario = run.record.run.scenario
     parts = other_parts(_definition(run), pinned()[scenario]) if scenario in pinned() else []
@@ -319,7 +319,7 @@ def _is_of_arm(run: Run) -> bool:
 
 
 def _same_parts(runs: list[Run], later: bool) -> Sifted:
-    """Keep the runs whose definition has the usual parts, those of `LATER` or the others, or none of them."""
+    """Keep the runs whose parts of `LATER`, or whose other parts, are the usual ones or missing."""
 
     def parts(run: Run) -> Any:
         found = _definition(run)
@@ -375,8 +375,8 @@ def same_settings(runs: list[Run]) -> Sifted:
 def _learner(run: Run) -> dict[str, Any]:
     """Return what the names of an agent, of a method and of a policy "module:Class" leave open.
 
-    Two agents that share a name make no row together, and neither do seeds of code that changed between them,
-    which the version of a method with a name of its own tells.
+    Two agents that share a name make no row together. Neither do seeds between which the code changed; for a
+    method with a name of its own, its version tells.
     """
     made, info = run.record.fingerprint, run.record.run
     method = made.get("method")
@@ -405,8 +405,8 @@ def _most(
 ) -> Sifted:
     """Keep the runs that have the usual trait of their group.
 
-    The usual trait is the one that most runs of built-in methods have, then most runs: no number of records
-    of other methods can move theirs off the board. Among equally frequent traits the first one counts.
+    The usual trait is the one that most runs of built-in methods have and, on a tie, most runs: no number of
+    records of other methods can push theirs off the board. Of equally frequent traits the first one counts.
     """
     members: dict[Hashable, dict[Hashable, list[Run]]] = {}
     for run in runs:
@@ -430,7 +430,7 @@ def _text(value: Any) -> str:
 
 
 def differences(values: Any, others: Any) -> list[str]:
-    """Return the names under which two dictionaries differ; none if they are no dictionaries."""
+    """Return the names under which two dictionaries differ; empty if they are not dictionaries."""
     if not isinstance(values, dict) or not isinstance(others, dict):
         return []
     names = sorted(set(values) | set(others))
@@ -440,11 +440,11 @@ def differences(values: Any, others: Any) -> list[str]:
 
 
 def mean_of(values: Iterable[float | None]) -> float | None:
-    """Return the mean of the values that are known, None without one."""
+    """Return the mean of the values that are known, None if none is."""
     known = [value for value in values if value is not None]
     return statistics.fmean(known) if known else None
 
 
 def is_number(value: Any) -> bool:
-    """Return whether a stranger's value is a number of any use."""
+    """Return whether a value that a stranger wrote is a usable number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e18

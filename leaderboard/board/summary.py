@@ -14,8 +14,8 @@ from .agreement import Concordance
 DIVISIONS = ("prior-data-free", "prior questions", "prior demonstrations", "online", "external", "reference")
 """Divisions in the order of the table: the first three by the prior data that a method may use; "online" for
 agents of other programs, which learned by trial, and "external" for policies that were fine-tuned elsewhere,
-on what their authors declare: no method is compared with either; "reference" for references, which do not
-compete."""
+on data that their authors declare: no method is compared with either; "reference" for references, which do
+not compete."""
 
 ELSEWHERE = ("online", "external")
 """Divisions of policies that another program trained: there is nothing to run again."""
@@ -24,10 +24,10 @@ METHODS = DIVISIONS[:3]
 """Divisions of methods, which start from the same policy and learn from the same demonstrations."""
 
 WITHOUT_DEMONSTRATIONS = METHODS[:2]
-"""Divisions of methods that may not look at prior demonstrations."""
+"""Divisions of methods that may not read prior demonstrations."""
 
 WITH_DEMONSTRATIONS = METHODS[2:]
-"""Divisions of methods that may."""
+"""Divisions of methods that may read prior demonstrations."""
 
 COSTS = {
     "steps": "optimiser_steps",
@@ -50,7 +50,7 @@ class RowSummary:
     """The numbers of one method on one scenario."""
 
     scenario: str
-    """Name of its table: the Gymnasium id, with the name of the policy if it is not the usual one."""
+    """Name of its table: the Gymnasium id, with the name of the policy if it is not the default one."""
     method: str
     """Name or "module:Class"."""
     division: str
@@ -59,7 +59,7 @@ class RowSummary:
     """Letters of its groups. Two rows of a scenario and division share a letter if they are not told apart.
     None for a reference, which does not compete, and for a row without a final average."""
     tier: str
-    """The lowest of `TIERS` among its runs: how far others than the submitter have checked them."""
+    """The lowest of `TIERS` among its runs: how far people other than the submitter have checked them."""
     seeds: tuple[int, ...]
     """Seeds of its runs."""
     to_criterion: bool
@@ -79,7 +79,7 @@ class NotShown:
     """A file that makes no row."""
 
     path: str
-    """Path from the folder of records."""
+    """Path, relative to the folder of records."""
     reason: str
     """Reason, in words."""
 
@@ -96,10 +96,10 @@ class Summary:
     starts: Mapping[str, float | None] = field(default_factory=dict)
     """Mean success of the pretrained policy on its skills, by scenario."""
     machines: Mapping[str, str] = field(default_factory=dict)
-    """Kind of processor on which all records of a scenario were made, if its worlds move otherwise there than
-    in the published records, by scenario."""
+    """Kind of processor on which all records of a scenario were made, if its worlds move differently there
+    than in the published records, by scenario."""
     unpaired: Mapping[str, Mapping[str, Sequence[int]]] = field(default_factory=dict)
-    """Seeds with which runs began with another pretrained policy than plain fine-tuning, by scenario and
+    """Seeds whose runs began with another pretrained policy than plain fine-tuning, by scenario and
     method."""
     agreements: Mapping[str, Concordance | None] = field(default_factory=dict)
     """How alike the seeds order the rows, by scenario."""
@@ -171,7 +171,7 @@ Value = TypeVar("Value")
 
 
 def letters_of(row: RowSummary, rows: Iterable[RowSummary]) -> str:
-    """Return the letters of a row; none if its division has no other row to tell it apart from.
+    """Return the letters of a row; empty if its division has no other row to tell it apart from.
 
     Args:
         row: The row.
@@ -192,7 +192,7 @@ def divisions_of(rows: Iterable[PlacedRow]) -> dict[str, list[PlacedRow]]:
 
 
 def competing(rows: Iterable[PlacedRow]) -> list[PlacedRow]:
-    """Return the rows of methods, which compete: references and what another program trained do not."""
+    """Return the rows of methods, which compete; references and policies from other programs do not."""
     return [row for row in rows if row.division in METHODS]
 
 

@@ -1,8 +1,8 @@
 """Tiers: how far a record was checked, and by whom.
 
-The record itself is never touched. `clbench verify` writes its findings into a file next to the record. They
-hold for the bytes that it read: a record that is changed afterwards loses its tier. So does one whose
-findings were changed or damaged.
+The record itself is never touched. `clbench verify` writes its findings into a file next to the record. The
+findings hold only for the bytes that it read: a record that is changed afterwards loses its tier, and so does
+a record whose findings were changed or damaged.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from clbench.base.strict_json import read_json
 from clbench.records.content import content_hash
 
 TIERS = ("self-reported", "recomputed", "replayed", "retrained")
-"""Checks of a record, from none: its metrics were computed again from its episodes; some of its episodes were
-run again; the whole run was repeated."""
+"""Tiers of a record, from no check at all: its metrics were computed again from its episodes; some of its
+episodes were run again; the whole run was repeated."""
 
 
 def verification_path(record: Path) -> Path:
@@ -32,7 +32,7 @@ def tier_of(record: Path) -> str:
 
 
 def checks_of(record: Path) -> list[Any]:
-    """Return the checks that gave the record at `record` its tier, none without a valid verification."""
+    """Return the checks that gave the record at `record` its tier, empty without a valid verification."""
     return [*_verification(record).get("checks", ())]
 
 

@@ -21,16 +21,16 @@ ARMS = ("consft", "consft_calibrated")
 """The published loss with a tuned first temperature; the same with a tuned factor of the loss."""
 
 LEAST_BETWEEN = 0.1
-"""Share of the weights between 0.01 and 0.9, before the last tenth of the schedule, from which an arm counts.
-Below it, most samples of most steps weigh alike: almost nothing, which Adam nearly cancels, or 1. The paper
-asks for no such share."""
+"""Least share of the weights between 0.01 and 0.9, before the last tenth of the schedule, with which an arm
+counts. Below it, most samples of most steps weigh alike: almost nothing, which Adam nearly cancels, or 1. The
+paper asks for no such share."""
 
 NEEDS_WEIGHTS = "Weights that differ between samples while the temperature is low."
 """What would change a verdict without an arm that counts."""
 
 
 def _counts(share: Figure) -> bool:
-    """Return whether an arm with this share has weights that differ between samples; unknown ones may."""
+    """Return whether an arm with this share has weights that differ between samples; an unknown one may."""
     return math.isnan(share.value) or share.value >= LEAST_BETWEEN
 
 
@@ -52,7 +52,7 @@ def inactive_sentences(evidence: Evidence) -> tuple[str, ...]:
 
 
 def inactive_reasons(evidence: Evidence, counting: Sequence[str]) -> list[tuple[str, str]]:
-    """Return these sentences as reasons for `cannot_be_shown`, which they are only if no arm counts."""
+    """Return these sentences as reasons for `cannot_be_shown`; they are reasons only if no arm counts."""
     return [(why, "" if counting else NEEDS_WEIGHTS) for why in inactive_sentences(evidence)]
 
 
@@ -74,7 +74,7 @@ def rises_above(bar: float, counting: Iterable[Figure], every: Iterable[Figure])
 
 
 def change_of_arms(verdict: Verdict, counting: Sequence[Figure], every: Sequence[Figure], bar: float) -> str:
-    """Return what would change the verdict of a bar on the arms: only one that counts makes a claim hold."""
+    """Return what would change the verdict of a bar on the arms: only a counting arm makes a claim hold."""
     if verdict != "undecided":
         judged = best_first(list(every if verdict == "does not hold" else counting))
         return what_would_change(deciding(verdict, judged, bar), bar)

@@ -32,7 +32,7 @@ PREDICATES: Mapping[Verdict, tuple[str, str]] = {
     "undecided": ("is undecided", "are undecided"),
     "cannot be shown here": ("cannot be shown here", "cannot be shown here"),
 }
-"""Verdicts as predicates: of one claim, and of several."""
+"""Verdicts as predicates: for one claim, and for several."""
 
 BOARDS = ("clbench/Fetch-v1", "clbench/MetaWorld-v1", "clbench/PointMaze-v1")
 """Scenarios at equal learning, with runs at the scenario's learning rate and controls: most claims are judged
@@ -91,7 +91,7 @@ class Claim:
     rule: str
     """When the claim holds, when it does not, and when the setting cannot show it; else it is undecided."""
     settled: datetime
-    """When the rule last changed in what it says: records that are older were known by then."""
+    """When the rule last changed in what it says: older records were known by then."""
     margin: str
     """Smallest difference that counts."""
     scenarios: tuple[str, ...]
@@ -113,7 +113,7 @@ def claim(
     scenarios: tuple[str, ...] = BOARDS,
     uncounted: str = "",
 ) -> Callable[[Callable[[Evidence], Finding]], Claim]:
-    """Return a decorator that makes a claim of the function that judges it; its docstring is the claim."""
+    """Return a decorator that turns the function that judges a claim into it; its docstring is the claim."""
 
     def enter(judge: Callable[[Evidence], Finding]) -> Claim:
         words = " ".join((judge.__doc__ or "").split())
@@ -150,8 +150,8 @@ def cannot_be_shown(
     Args:
         figures: Figures of the rule.
         controls: Other figures.
-        reasons: Why it cannot be shown, each with what would remove the reason; all must go. The second text
-            is empty for a sentence that gives no reason.
+        reasons: Why it cannot be shown, each with what would remove the reason; all reasons must be removed.
+            The second text is empty for a sentence that gives no reason.
         more: Further sentences.
         about: See `Finding.about`.
     """
@@ -184,7 +184,7 @@ def deciding(verdict: Verdict, figures: Sequence[Figure], bar: float) -> Figure:
 
     Args:
         verdict: Verdict of the rule.
-        figures: Figures of the rule, the largest first: an open rule hangs on it.
+        figures: Figures of the rule, the largest first: an undecided rule depends on it.
         bar: Bar of the rule.
     """
     known = [figure for figure in figures if not figure.is_unknown]
@@ -204,7 +204,7 @@ def _seeds_for(reach: float, half: float, seeds: int) -> int | None:
     """Return the number of seeds whose Student interval reaches no further than `reach`, None if too many.
 
     Args:
-        reach: Half the width that is wished.
+        reach: Half the width that is wanted.
         half: Half the width with `seeds` seeds.
         seeds: Number of seeds now, at least 2.
     """

@@ -81,7 +81,7 @@ def sft_degrades(evidence: Evidence) -> Finding:
 
 
 def _what_joint_says(gain: Figure, learned: Figure) -> tuple[str, ...]:
-    """Return whether training on all data keeps more than sft at its learning rate; nothing if unknown."""
+    """Return whether training on all data keeps more than sft at its learning rate; empty if unknown."""
     if gain.is_unknown:
         return ()
     if gain.low > 0:
@@ -154,7 +154,7 @@ def keeps_20_points_more(evidence: Evidence) -> Finding:
 
 
 ONE_SIDED = " Without runs of both arms at the scenario's learning rate, the claim can hold, but not fail."
-"""What C2 lacks on a board without these."""
+"""What C2 lacks on a board without these runs."""
 
 KEEPS_TOO_MUCH = (
     "sft keeps too much for a gain of 0.20.",
@@ -242,9 +242,10 @@ def _lower_end(figure: Figure) -> float:
 def _deciding_replay(
     verdict: Verdict, counting: Sequence[Sequence[Figure]], every: Sequence[Sequence[Figure]]
 ) -> Figure:
-    """Return the figure on which the verdict of C3 hangs, of the figures of each arm against each replay.
+    """Return the figure that decides C3, among the figures of each arm against each kind of replay.
 
-    An arm reaches replay by its lowest lower end, and fails by its lowest upper end.
+    The lowest lower end of an arm decides whether it reaches replay, and its lowest upper end decides whether
+    it fails.
     """
     if verdict == "does not hold":
         return max((min(arm, key=_upper_end) for arm in every), key=_upper_end)
@@ -252,7 +253,7 @@ def _deciding_replay(
 
 
 def _keeps_fewer(evidence: Evidence, figure: Figure) -> str:
-    """Return that an arm certainly keeps fewer skills than a kind of replay."""
+    """Return the sentence that an arm certainly keeps fewer skills than a kind of replay."""
     arm, replay = figure.methods[:2]
     share = _share_of_replay(evidence) if replay == "experience_replay" else ""
     return f"{replay}{share} certainly keeps more skills than {arm}."

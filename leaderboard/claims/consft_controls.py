@@ -1,4 +1,4 @@
-"""The controls of ConSFT: the method without its ingredient, and what each says of a gain."""
+"""The controls of ConSFT: the method without its ingredient, and what each says about a gain."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CONTROLS = {
         "a learning rate that follows the loss does not suffice",
     ),
 }
-"""Controls of ConSFT: what one says that is not told apart from it, and one that is worse."""
+"""Controls of ConSFT: what follows if one is not told apart from it, and what if one is worse."""
 
 
 def controls_of(evidence: Evidence, arm: str) -> tuple[Figure, ...]:
@@ -32,7 +32,7 @@ def controls_of(evidence: Evidence, arm: str) -> tuple[Figure, ...]:
 
 
 def sft_at_the_rate_of(evidence: Evidence, arm: str) -> tuple[str, ...]:
-    """Return the label of sft at the arm's learning rate, if tuning chose another for sft and it ran."""
+    """Return the label of sft at the arm's learning rate, if tuning chose another for sft and runs exist."""
     runs = [evidence.first_run(label) for label in (arm, "sft")]
     factors = [run.record.run.settings.get("step_factor", PUBLISHED) for run in runs if run is not None]
     if len(factors) < len(runs) or factors[0] == factors[1]:
@@ -42,7 +42,7 @@ def sft_at_the_rate_of(evidence: Evidence, arm: str) -> tuple[str, ...]:
 
 
 def controls_at_the_full_rate(evidence: Evidence) -> tuple[Figure, ...]:
-    """Return the gains of consft_calibrated over two controls at the scenario's rate, if they ran."""
+    """Return the gains of consft_calibrated over two controls at the scenario's rate, if runs exist."""
     labels = [f"{name}+step_factor={PUBLISHED}" for name in ("constant_weight", "shuffled_weights")]
     arm = rung("consft_calibrated", PUBLISHED)
     return tuple(kept(evidence, arm, label) for label in labels if label in evidence.runs)
@@ -61,7 +61,7 @@ def what_the_full_rate_says(gain: Figure, controls: Sequence[Figure]) -> list[st
 
 
 def what_controls_say(gain: Figure, figures: Sequence[Figure], arms: Sequence[str]) -> list[str]:
-    """Return what the controls of the arms that count say of a gain over sft, if there is one."""
+    """Return what the controls of the arms that count say about a gain over sft, if there is one."""
     if gain.low <= 0:
         method, other = gain.methods[:2]
         return [f"{method} does not certainly keep more than {other}: there is no gain to explain."]

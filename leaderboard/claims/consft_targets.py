@@ -1,4 +1,4 @@
-"""What ConSFT claims of targets: earlier ones are kept (C7), and new ones work elsewhere, too (C8)."""
+"""What ConSFT claims about targets: earlier ones are kept (C7), and new ones work elsewhere, too (C8)."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ from ..board.runs import ALIKE, Run, is_number, read_run, read_runs
 from ..board.summary import NotShown
 
 LEAST_SEEDS = 2
-"""An interval of one seed does not cover other seeds: it is shown but decides nothing."""
+"""Fewest seeds that decide: an interval of one seed does not cover other seeds, and is only shown."""
 
 SHARE: Span = (0.0, 1.0)
 """Least and greatest value of a share."""
@@ -105,7 +105,7 @@ class Evidence:
         return min((start for start in starts if start), default=None)
 
     def first_run(self, method: str) -> Run | None:
-        """Return the run of a method with the lowest seed, None without one."""
+        """Return the run of a method with the lowest seed, None if it has no runs."""
         return next(iter(self.runs.get(method, {}).values()), None)
 
     # ---- figures of scores -------------------------------------------------------------------------
@@ -128,7 +128,7 @@ class Evidence:
             methods: Labels of all methods that `quantity` reads, the subject first.
             span: Smallest and largest possible value.
             ratio: Whether the values are positive ratios, see `clbench.scoring.intervals.interval`.
-            note: Restriction of the figure, in words. Without one, it says why the figure decides nothing.
+            note: Restriction of the figure, in words. If empty, the note says why the figure decides nothing.
             form: Format of the number.
         """
         methods = tuple(dict.fromkeys(methods))
@@ -207,7 +207,7 @@ class Evidence:
     def pooled(
         self, method: str, what: str, read: Callable[[Sequence[Mapping[str, Any]]], Any], span: Span
     ) -> Figure:
-        """Return the mean over seeds of what `read` makes of the diagnostics of all stages of a run."""
+        """Return the mean over seeds of what `read` computes from the diagnostics of all stages of a run."""
 
         def values(run: Run) -> list[Any]:
             value = read([found for found in run.record.diagnostics.values() if isinstance(found, dict)])
@@ -218,9 +218,9 @@ class Evidence:
     def diagnostic_ratio(
         self, method: str, other: str, what: str, read: Callable[[Mapping[str, Any]], float]
     ) -> Figure:
-        """Return what `read` makes of the diagnostics of a run, divided by that of the other with its seed.
+        """Return the ratio of what `read` computes from the diagnostics of two methods, seed by seed.
 
-        It is the mean over seeds; `read` returns NaN for diagnostics without a usable number.
+        The ratio is averaged over seeds; `read` returns NaN for diagnostics without a usable number.
         """
         seeds = self.common_seeds((method, other))
         parts, wholes = (
@@ -266,7 +266,7 @@ class Evidence:
         *,
         ratio: bool,
     ) -> Figure:
-        """Return the mean of one value for each seed; none without a run, or if a value is no number."""
+        """Return the mean of one value for each seed; none without a run, or if a value is not a number."""
         if not values or not np.isfinite(values).all():
             missing = tuple(label for label in methods if not self.runs.get(label))
             note = "" if missing else "not in these records"
@@ -296,7 +296,7 @@ def _start_of(run: Run) -> datetime | None:
 
 
 def _words(name: str) -> str:
-    """Return a metric in the name of a figure, which seeds its interval: a title of the pages may change."""
+    """Return a metric's words in the name of a figure. They seed its interval; titles of pages may change."""
     return name.replace("_", " ")
 
 
@@ -313,9 +313,10 @@ def measured(name: str, method: str) -> Quantity:
 
 
 def read_evidence(records: Path, controls: Path) -> Callable[[str], Evidence]:
-    """Read the folders and files, and return what gives the evidence on a scenario; missing ones are empty.
+    """Read all records, and return a function that gives the evidence on a scenario.
 
-    A run of the ladder has the label of `rung`. The ladder's folder lies beside that of the records.
+    Missing folders count as empty. A run of the ladder has the label that `rung` returns. The ladder's folder
+    lies beside that of the records.
     """
     scored, refused = read_runs(records, read_run, ALIKE)
     sifts = (like_the_board(scored), *ALIKE)
@@ -343,5 +344,5 @@ def read_evidence(records: Path, controls: Path) -> Callable[[str], Evidence]:
 
 
 def rung(method: str, factor: float) -> str:
-    """Return the label of a run of the ladder: the method and its factor, as "sft@0.3"."""
+    """Return the label of a run of the ladder: the method and its factor, such as "sft@0.3"."""
     return f"{method}@{factor:g}"

@@ -1,7 +1,8 @@
 """The claims of Fast-dVLA, each with its rule; docs/history.md says which rules changed, and why.
 
 Fast-dVLA has the abstract of CapVector; most claims here are CapVector's. Its claims are about how fast and
-how well a policy adapts. With stages to a criterion all methods learn as well, so the rules compare steps.
+how well a policy adapts. With stages to a criterion, all methods learn equally well, so the rules compare
+steps.
 """
 
 from __future__ import annotations
@@ -36,24 +37,24 @@ A_CAPABILITY = "An auxiliary objective that speeds up learning, or a policy that
 
 
 FEWEST_STEPS = 20
-"""Median steps of a stage of sft from which 5 % of them are a whole step."""
+"""Median steps of a stage of sft at which 5 % of the steps are one whole step."""
 
 TOO_SHORT = "5 % of the steps of sft's median stage is less than one step."
 LONGER = "Targets that take plain fine-tuning at least 20 steps at the scenario's learning rate."
 
 
 def _is_too_short(stage: Figure, steps: Figure) -> bool:
-    """Return whether stages are too short for the open question whether 5 % of the steps are saved."""
+    """Return whether stages are too short for the open question of whether 5 % of the steps are saved."""
     return stage.value < FEWEST_STEPS and is_open(steps, 0.95) and not steps.is_unknown
 
 
 def _no_capability(evidence: Evidence) -> bool:
-    """Return whether the records show that the auxiliary objective itself is no help."""
+    """Return whether the records show that the auxiliary objective itself does not help."""
     return share_of_steps(evidence, CO_TRAINING, SFT).low > 0.95
 
 
 def _why_known(evidence: Evidence) -> str:
-    """Return why a board says nothing of an objective that the policy knows, and whether it helps there."""
+    """Return why a board says nothing about an objective that the policy knows, and if it helps there."""
     if not _no_capability(evidence):
         return f"{KNOWN}: whether the objective could add anything here is open."
     return (

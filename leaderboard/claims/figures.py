@@ -45,7 +45,7 @@ def kept(evidence: Evidence, method: str, other: str) -> Figure:
 
 
 TOLD = ("replay", "tau_start", "loss_scale", "orthogonal", "schedule", "step_factor")
-"""Hyper-parameters that tell how a run of a label differs from the published method."""
+"""Hyper-parameters that show how the runs with a label differ from the published method."""
 
 
 def _settings(evidence: Evidence, *methods: str) -> str:
@@ -64,7 +64,7 @@ def share_of_steps(evidence: Evidence, method: str, other: str) -> Figure:
 
     It is the geometric mean over targets and seeds.
 
-    A target that is never learned counts with the budget's steps, and one that was known with one step.
+    A target that is never learned counts with the budget's steps, and a target that was known with one step.
     """
 
     def ratio(of: Of) -> Array:
@@ -121,7 +121,8 @@ def learning_curve(evidence: Evidence, method: str) -> tuple[tuple[int, ...], li
 def early_success(evidence: Evidence, method: str, other: str) -> Figure:
     """Return the difference in success on the targets, averaged over the evaluated steps of a stage.
 
-    The points halve towards the beginning, so that the mean tells how early a target is learned.
+    The distances of the points halve towards the beginning, so that the mean tells how early a target is
+    learned.
     """
 
     def difference(of: Of) -> Array:
@@ -183,7 +184,7 @@ def _without_impossible(scores: Scores) -> Scores:
 
 
 def drift_ratio(evidence: Evidence, method: str) -> Figure:
-    """Return how far hidden states move, divided by sft's, geometric mean over seeds.
+    """Return how far hidden states move, relative to sft, as the geometric mean over seeds.
 
     The recorded drift is a squared distance.
     """
@@ -212,7 +213,7 @@ def anchor_ratio(evidence: Evidence) -> Figure:
 
 
 ENDS = {"before the first step": 0, "at the end of the first stage": -1}
-"""Places among the distances of the first stage, by their words."""
+"""Places among the distances of the first stage, by their names in a sentence."""
 
 
 def anchor_distance(evidence: Evidence, method: str, end: str) -> Figure:
@@ -250,13 +251,14 @@ def median_stage(evidence: Evidence, method: str) -> Figure:
 def share_between(evidence: Evidence, method: str, afterwards: bool = False) -> Figure:
     """Return the share of ConSFT's weights between 0.01 and 0.9 before the last tenth of the schedule.
 
-    Weights below are near the floor, most of them alike, and weights above are those of plain fine-tuning. In
-    the last tenth and after the schedule the method is plain fine-tuning for small losses by design.
+    Weights below this range are near the floor, most of them alike, and weights above it are those of plain
+    fine-tuning. In the last tenth and after the schedule the method is plain fine-tuning for small losses by
+    design.
 
     Args:
         evidence: Records of the scenario.
         method: Label of the method.
-        afterwards: Take the weights of the last tenth and after it instead.
+        afterwards: Whether to take the weights of the last tenth and after it instead.
     """
 
     def share(stages: Sequence[Mapping[str, Any]]) -> float | None:

@@ -1,4 +1,4 @@
-"""All claims, judged by the records."""
+"""All claims, judged from the records."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sentences of the findings on the order of the methods, and on what its differences are due to."""
+"""Sentences of the findings on the order of the methods, and on what explains its differences."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def agreement_sentences(board: Board, boards: Mapping[str, list[Row]]) -> Iterat
 
 
 def holm(chances: Sequence[float]) -> list[float]:
-    """Return several p corrected for their number (Holm 1979, Scandinavian Journal of Statistics 6)."""
+    """Return p-values corrected for their number (Holm 1979, Scandinavian Journal of Statistics 6)."""
     corrected, least = [0.0] * len(chances), 0.0
     for place, index in enumerate(sorted(range(len(chances)), key=chances.__getitem__)):
         least = max(least, min(1.0, (len(chances) - place) * chances[index]))
@@ -65,7 +65,7 @@ def holm(chances: Sequence[float]) -> list[float]:
 
 
 def after_correction(chances: Sequence[float]) -> Iterator[str]:
-    """Yield how many of several p stay below 0.05 after Holm's correction, if one is below without it."""
+    """Yield how many p-values stay below 0.05 after Holm's correction, if any is below without it."""
     below = sum(chance < SIGNIFICANCE for chance in chances)
     if len(chances) < 2 or not below:
         return
@@ -81,7 +81,7 @@ DEFINITIONS = ("kept_share", "forgetting", "backward_transfer")
 
 
 def _definitions(boards: Mapping[str, list[Row]]) -> Iterator[str]:
-    """Yield how alike metrics order the methods. They share episodes: chance is not the question."""
+    """Yield how alike metrics order the methods. They share episodes, so chance is not tested."""
     found = {name: _taus(rows) for name, rows in boards.items()}
     for name, taus in found.items():
         if taus:
@@ -111,10 +111,10 @@ def without_demonstrations(rows: Iterable[Row]) -> list[Row]:
 
 
 def _shares_of_variance(name: str, rows: Sequence[Row]) -> Iterator[str]:
-    """Yield which share of the variance of the final average the method explains, and which the seed.
+    """Yield the shares of the variance of the final average that the method and the seed explain.
 
-    It is omega squared of the table of methods and seeds: sums of squares less what noise alone adds to them
-    (Hays 1963). Equal methods explain 0 % in the mean.
+    The shares are omega squared of the table of methods and seeds: sums of squares minus what noise alone
+    adds to them (Hays 1963). For equal methods they are 0 on average, before negative values become 0.
 
     Args:
         name: Name of the scenario.
@@ -152,7 +152,7 @@ def _common(
 
     Args:
         rows: Rows of a scenario.
-        others: Rows of another one, or the same.
+        others: Rows of another scenario, or of the same one.
         metric: Metric of the first rows.
         other_metric: Metric of the others.
     """

@@ -48,7 +48,7 @@ def _tally(judged: Sequence[Judged]) -> list[str]:
 
 
 def _corrected(here: Sequence[Judged]) -> str:
-    """Return how many rules changed after the first record of the scenario on which they judge."""
+    """Return how many rules changed after the first record of the scenario that they judge."""
     began = here[0].evidence.began
     if began is None:
         return ""

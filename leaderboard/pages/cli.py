@@ -163,7 +163,7 @@ def scenario_card(
 def _evidence(
     scenario: str | None, records: Path, controls: Path, optional: bool = False
 ) -> Callable[[str], Evidence]:
-    """Return what gives the evidence on a scenario.
+    """Return the function that gives the evidence on a scenario.
 
     A scenario without records that is not registered is refused, and so is a missing folder of records unless
     it is optional.

@@ -129,12 +129,12 @@ def _claims_in_short(judged: Sequence[Judged]) -> list[str]:
 
 
 def _boards(board: Board) -> dict[str, list[Row]]:
-    """Return the rows of each scenario at equal learning, with the usual policy."""
+    """Return the rows of each scenario at equal learning, with the default policy."""
     return {name: rows for name, rows in _usual(board).items() if rows[0].to_criterion}
 
 
 def _usual(board: Board) -> dict[str, list[Row]]:
-    """Return the rows of each scenario with the usual policy."""
+    """Return the rows of each scenario with the default policy."""
     return {
         name: rows for name, rows in tables_of(board.rows).items() if table_parts(name)[1] == DEFAULT_POLICY
     }
@@ -247,7 +247,7 @@ def _verdict_cell(one: Judged, what: str) -> str:
 def _explanations(judged: Sequence[Judged]) -> list[str]:
     """Return the last conclusion from the figures and controls of each verdict that is a yes or a no.
 
-    A claim that fails where it was made to hold has the conditions beside it, as one that holds has.
+    If a claim fails on the scenario that was made to show it, the sentence says so, as it does if it holds.
     """
     told = grouped(
         ((one.claim, sentence), one.evidence.scenario)

@@ -50,7 +50,7 @@ def gain_table(
 
 
 def gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]]) -> Iterator[str]:
-    """Yield what Tukey's test of all rows without prior demonstrations says of each gain.
+    """Yield what Tukey's test of all rows without prior demonstrations says about each gain.
 
     Args:
         name: Name of the scenario.
@@ -113,7 +113,7 @@ def _losses(gains: Mapping[str, Estimate]) -> dict[str, Estimate]:
 def _over_tied_settings(name: str, tied: Mapping[str, Sequence[TiedGain]]) -> Iterator[str]:
     """Yield how plain fine-tuning at a tied setting compares with the chosen one.
 
-    Methods below it are not named: they have settings that tied, too, of which the board has one.
+    Methods below it are not named: they, too, have tied settings, of which the board has only one.
     """
     for one in tied.get(BASELINE, ()):
         more = _losses({BASELINE: one.gain}).get(BASELINE)

@@ -23,7 +23,7 @@ def rate_sentences(
 
     Args:
         frontiers: Curves of each scenario with a ladder.
-        boards: Rows of each scenario with the usual policy.
+        boards: Rows of each scenario with the default policy.
         evidence: Returns the runs of the scenario with a Gymnasium id, those of the ladder included.
     """
     for name, curves in frontiers.items():

@@ -210,7 +210,7 @@ def _tried(method: str) -> list[Tried]:
 
 
 def _doubts(method: str) -> list[str]:
-    """Return sentences on choices that a tie or the end of a range made."""
+    """Return sentences on choices that a tie decided, or that lie at the end of a range."""
     sentences: list[str] = []
     ends: list[tuple[str, str]] = []
     for scenario, found in _tunings(method):

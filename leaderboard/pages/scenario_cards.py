@@ -59,7 +59,7 @@ TELLING = ("retention", "adaptation", RANKED_BY, "question_retention")
 """Metrics that tell methods apart; none needs a reference."""
 
 SEEDS = (DEFAULT_SEEDS, 2 * DEFAULT_SEEDS)
-"""Numbers of seeds for which a card says which differences show."""
+"""Numbers of seeds for which a card says which differences can be told apart."""
 
 PRETRAINED = 0.90
 """Lowest success of the pretrained policy on the retained skills: it cannot forget what it does not know."""
@@ -177,7 +177,7 @@ class Card:
     def _of_runs(
         self, row: Row, quantity: Callable[[Rates], Array], span: tuple[float, float] = (0, 1)
     ) -> Estimate:
-        """Return a quantity (..., runs) of the runs of a row, most of them of how the runs begin."""
+        """Return the mean of a quantity (..., runs) over the runs of a row, such as of how they begin."""
         generator = row_generator(self.scenario.id, f"pretrained {quantity.__name__}")
         runs = {"one": list(row.scores.values())}
         return bootstrap(lambda of: average(quantity(of["one"])), runs, generator, span=span)

@@ -1,6 +1,6 @@
 """What a policy sees and does, for a scenario's card: shapes, and what the numbers of a state mean.
 
-The words are those of the code: the second paragraph in the docstring of the world's class and of its
+The words come from the code: the second paragraph in the docstring of the world's class and of its
 camera's, and the module `state` of the world's package with the docstrings of its slices.
 """
 
@@ -52,7 +52,7 @@ def spaces_of(scenario: Scenario) -> Spaces:
     world = resolve(first.world)
     described = getattr(
         world, "vector_world", world
-    )  # of a MuJoCo world, the class of many lanes has the words
+    )  # for a MuJoCo world, the class of many lanes has the words
     words = [_second_paragraph(described)]
     parts: tuple[tuple[str, str], ...] = ()
     if first.camera is not None:  # a policy sees what the camera passes on, and not the state of the world

@@ -85,7 +85,7 @@ def make_missing(
     Args:
         scenario: Scenario with the tasks.
         folder: Folder of the card.
-        episodes: Number of episodes of each task. They are the same each time and have no other use.
+        episodes: Number of episodes of each task. The episodes are the same each time and have no other use.
         drawing: Whether pictures can be drawn.
         console: Console that shows the progress.
     """

@@ -25,7 +25,7 @@ class Decoder:
     success: float
     """Share of the skills' validation episodes that succeed."""
     difference: Estimate
-    """Difference of success to easy-first decoding, in paired episodes."""
+    """Difference in success from easy-first decoding, in paired episodes."""
     forwards: float
     """Mean forwards of the head per chunk."""
     tokens: float
@@ -48,8 +48,8 @@ class Decoding:
     decoders: tuple[Decoder, ...]
     """Easy-first decoding comes first."""
     widths: Mapping[int, Mapping[str, Estimate]]
-    """By width of the policy: easy-first decoding of a chunk to the pipeline's forwards (`chunk`), and one
-    forward of all tokens to one of a block (`forward`), both as ratios of time."""
+    """Ratios of time by width of the policy: easy-first decoding of a chunk to the pipeline's forwards
+    (`chunk`), and one forward of all tokens to one forward of a block (`forward`)."""
 
     @property
     def table(self) -> str:
@@ -63,7 +63,7 @@ class Decoding:
 
 
 def read_decoding(path: Path = RESULTS) -> Decoding | None:
-    """Return the results, None if the benchmark has left none."""
+    """Return the results, None if the benchmark has not written any."""
     if not path.is_file():
         return None
     values: Mapping[str, Any] = read_json(path)

@@ -1,4 +1,4 @@
-"""The tier "replayed": episodes, questions and checks, once more with the policies of the stages."""
+"""The tier "replayed": episodes, questions and checks are repeated with the policies of the stages."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LARGEST_DRIFT = 0.05
 """Largest distance of a repeated policy from the kept one, as a share of how far the stage moved it."""
 
 MISSED = 0.05
-"""Probability at which a look at some episodes may miss made-up ones."""
+"""Probability with which a look at some episodes may miss made-up ones."""
 
 
 def replay(subject: Subject, progress: ProgressCallback) -> list[Check]:
@@ -96,8 +96,8 @@ def _same_pretraining(subject: Subject) -> bool:
 def _start(subject: Subject, first: Policy, progress: ProgressCallback) -> Check:
     """Compare the kept policy before the first target with what pretraining and `prepare` give here.
 
-    Nothing but equal bits will do. On another processor, pretraining ends far away: with AVX2 instructions
-    on Fetch-v1 at a distance of 29 from where AVX512 leads, with weights of norm 204.
+    Only equal bits pass. On another processor, pretraining ends far away: on Fetch-v1, AVX2 instructions lead
+    to a distance of 29 from where AVX512 leads, with weights of norm 204.
     """
     trainer = Trainer.open(
         subject.scenario, subject.resolved.new_method, subject.spec.seed, subject.spec.device
@@ -186,8 +186,8 @@ def _replay_ends(subject: Subject, policies: Sequence[Policy], lengths: list[int
 def _go_on(subject: Subject, kept: Path, policies: Sequence[Policy]) -> Check:
     """Train a randomly chosen stage again from the kept policy before it, and compare with the one after it.
 
-    Policies of another method, under this one's name, do not follow from each other. On another GPU the last
-    bits differ.
+    Policies of another method that are passed off as this one's do not follow from each other. On another GPU
+    the last bits differ.
     """
     run = subject.resolved
     number = int(np.random.default_rng(subject.request.seed).integers(len(run.scenario.target))) + 1

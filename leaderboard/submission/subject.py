@@ -57,7 +57,7 @@ class Request:
     policy: str | None = None
     """module:Class of a policy that is not built in; the name in a record alone is never imported."""
     any_processor: bool = False
-    """Whether to repeat training also on a processor that may compute otherwise than the record's."""
+    """Whether to repeat training even on a processor that may compute differently from the record's."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Subject:
 
     @property
     def strange(self) -> list[str]:
-        """Names of its method and policy that may not be imported: not ours, nor named by the verifier."""
+        """Names of its method and policy that may not be imported: neither ours nor named by the verifier."""
         run = self.run.record.run
         method = [] if run.method in (*method_names(), self.request.method) else [run.method]
         policy = [] if is_built_in(run.policy) or run.policy == self.request.policy else [run.policy]
@@ -124,9 +124,9 @@ class Subject:
 
     @property
     def other_processor(self) -> str | None:
-        """The record's processor and this one, in words, if they may compute otherwise; else None.
+        """The record's processor and this one, in words, if they may compute differently; else None.
 
-        Equal results still prove a record that was made on another processor; other results prove nothing.
+        Equal results prove a record even if it was made on another processor; different ones prove nothing.
         """
         theirs, ours = (_processor(made) for made in (self.run.record.fingerprint, self.here))
         if all(theirs[name] in (None, value) for name, value in ours.items()):
@@ -141,10 +141,10 @@ class Subject:
 
 
 def _processor(made: dict[str, Any]) -> dict[str, str | None]:
-    """Return what decides the bits of training, of a fingerprint: None where it lacks a value.
+    """Return what determines the bits of training, according to a fingerprint; None where it lacks a value.
 
-    The maker is the first word of the model. The oldest records do not have the instructions, and those
-    before `arithmetic_hash` not the arithmetic.
+    The maker is the first word of the model. The oldest records lack the instructions, and records from
+    before `arithmetic_hash` lack the arithmetic.
     """
     hardware = made.get("hardware")
     values = hardware if isinstance(hardware, dict) else {}

@@ -62,8 +62,8 @@ _ACTORS = {"online": "an agent that learned online", "external": "a policy serve
 """What acted in the runs of `ELSEWHERE`."""
 
 OTHER_TIME = 2.0
-"""Factor between two measurements of one time of a step that chance does not explain: within a method, those
-of the published records differ by at most 1.59."""
+"""Factor between two measurements of the time of a step that chance does not explain: within a method, the
+published records differ by at most 1.59."""
 
 ORIGIN = {
     "versions": (),
@@ -78,8 +78,8 @@ def verify(
 ) -> list[Check]:
     """Check the record at `path`, write its tier into a file next to it, and return the checks.
 
-    The first tier with a check that does not pass is the last one. A failed check deletes the file of an
-    earlier verification. A check that cannot be made here leaves it as it is, and so does a lower tier.
+    Checking ends at the first tier with a check that does not pass. A failed check deletes the file of an
+    earlier verification. A check that cannot be made here leaves the file as it is, and so does a lower tier.
 
     Args:
         path: Path of the record.
@@ -136,7 +136,7 @@ def _in_doubt(subject: Subject, checks: list[Check]) -> list[Check]:
 
 
 def _other_machine(subject: Subject) -> list[str]:
-    """Return in words in what the record's machine is of another kind: ARM's MuJoCo rounds otherwise."""
+    """Return in words how the record's machine is of another kind: MuJoCo on ARM rounds differently."""
     recorded = subject.run.record.fingerprint.get("hardware")
     values = recorded if isinstance(recorded, dict) else {}
     here = subject.here["hardware"]
@@ -200,7 +200,7 @@ def _recompute(subject: Subject, _: ProgressCallback) -> list[Check]:
 
 
 def _check_simulator(subject: Subject) -> Check:
-    """Check that the simulator moves as it did."""
+    """Check that the simulator moves as it did for the record."""
     recorded, found = subject.run.record.fingerprint.get("rollouts"), subject.here["rollouts"]
     if recorded == found:
         return Check("simulator", "same rollouts as here", True)
@@ -209,7 +209,7 @@ def _check_simulator(subject: Subject) -> Check:
 
 
 def _differs(subject: Subject, name: str, result: str) -> Check:
-    """Return the check of what differs here: with other packages or another machine, it may be true there."""
+    """Return the check of a difference, which packages or machines other than the record's may explain."""
     other = [*_made_with(subject, simulator_versions(subject.scenario.tasks)), *_other_machine(subject)]
     return Check(name, "; ".join([result, *other]), None if other else False)
 
@@ -337,7 +337,7 @@ def _check_origin(subject: Subject, again: Record) -> Check:
 
 
 def _origin(record: Record) -> dict[str, Any]:
-    """Return what a record says about itself and a repetition can confirm."""
+    """Return what a record says about itself that a repetition can confirm."""
     found: dict[str, Any] = {}
     for part, names in ORIGIN.items():
         values = record.fingerprint.get(part)
@@ -356,14 +356,14 @@ def _as_dictionary(part: Any) -> Any:
 
 @dataclass(frozen=True)
 class Verification:
-    """What came of the verification of a record."""
+    """The outcome of the verification of a record."""
 
     path: Path
     """Path of the record."""
     checks: list[dict[str, Any]]
-    """The checks that were made: of each its name, what it found, and whether the record passed."""
+    """The checks that were made, each with its name, what it found, and whether the record passed."""
     failure: str | None
-    """Why it did not reach the tier, None if it did."""
+    """Why the record did not reach the tier, None if it did."""
 
 
 def run_verifications(

@@ -23,7 +23,7 @@ _ITEM = re.compile(r"\d+\. +(.*)")
 
 
 COMMON: dict[str, Any] = {field.name: field.default for field in dataclasses.fields(Method)}
-"""Hyper-parameters of every method with their defaults: pages of methods list only other defaults of them."""
+"""Hyper-parameters of every method with their defaults: the pages of methods list only other defaults."""
 
 RULES: Mapping[str, str] = dict(
     zip(
@@ -90,7 +90,7 @@ class Description:
         return division_of(dataclasses.asdict(self.cls.uses))
 
     def hook(self, name: str) -> list[str]:
-        """Return the paragraphs on what a hook returns, none if the method does not override the hook."""
+        """Return the paragraphs on what a hook returns, empty if the method does not override the hook."""
         function = getattr(self.cls, name)
         if function is getattr(Method, name):
             return []

@@ -16,10 +16,10 @@ from clbench.base.text import print_plain
 def write_all(texts: Mapping[Path, str]) -> dict[Path, bool]:
     """Write the texts to their paths, all or none.
 
-    Nothing is replaced before everything is written beside its place: a full disk leaves the old files.
+    No file is replaced before all texts are written beside their places: a full disk leaves the old files.
 
     Returns:
-        Whether each file was written: one that has its text already is left alone.
+        Whether each file was written; a file that already has its text is left alone.
 
     Raises:
         InputError: The file system refuses one of them.
@@ -41,7 +41,7 @@ def write_all(texts: Mapping[Path, str]) -> dict[Path, bool]:
 
 
 def print_written(written: Mapping[Path, bool]) -> None:
-    """Print what `write_all` returned."""
+    """Print which files `write_all` wrote, and which it left unchanged."""
     console = Console()
     for path, is_written in written.items():
         print_plain(console, f"{'Written' if is_written else 'Unchanged'}: {path}")

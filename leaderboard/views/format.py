@@ -95,9 +95,9 @@ class Column:
 
 
 def shown(rows: Rows) -> tuple[Column, ...]:
-    """Return the columns of a table of `rows`: the metrics of its kind of scenario that a row has a value of.
+    """Return the columns of a table: the metrics of its kind of scenario for which any of `rows` has a value.
 
-    A table over scenarios of both kinds has those of fixed stages.
+    A table over scenarios of both kinds has the metrics of fixed stages.
     """
     to_criterion = _to_criterion(rows)
     names = TO_CRITERION if to_criterion else FIXED
@@ -122,7 +122,7 @@ def fitting(rows: Rows) -> tuple[Column, ...]:
 
 
 def fitting_names(rows: Rows) -> tuple[str, ...]:
-    """Return the metrics of such columns, also those that no row has a value of."""
+    """Return the metrics of such columns, including those for which no row has a value."""
     return FITTING_TO_CRITERION if _to_criterion(rows) else FITTING_FIXED
 
 
@@ -134,8 +134,8 @@ def start_text(rate: float | None) -> str:
     """Return a sentence on what the pretrained policy can do, with a warning if it has little to forget.
 
     Args:
-        rate: Its mean success on its skills. The sentence is empty without one: no row begins with the
-            pretrained policy, or no skill is retained.
+        rate: The policy's mean success on its skills. If it is None, because no row begins with the
+            pretrained policy or no skill is retained, the sentence is empty.
     """
     if rate is None:
         return ""
@@ -144,7 +144,7 @@ def start_text(rate: float | None) -> str:
 
 
 def machine_text(machine: str | None) -> str:
-    """Return a sentence on a table that no other may be compared with; see `Summary.machines`."""
+    """Return a sentence on a table that must not be compared with others; see `Summary.machines`."""
     if not machine:
         return ""
     return (
@@ -213,7 +213,7 @@ def title_of(name: str) -> str:
 
 
 def number_text(value: float | None, form: str, missing: str = MISSING) -> str:
-    """Return `value` in the format `form`. Rounded twice, so that the last bit of a sum does not show."""
+    """Return `value` in the format `form`. It is rounded twice, to hide the last bit of a sum."""
     if value is None:
         return missing
     text = format(round(value, 9), form)
@@ -259,13 +259,13 @@ def standing_text(row: Row, rows: Iterable[Row], named: int | None = None) -> st
 
 
 def tier_text(row: Row) -> str:
-    """Return the tier of a row and the runs above it: "self-reported; 1 of 12 runs retrained"."""
+    """Return the tier of a row and the number of runs above it: "self-reported; 1 of 12 runs retrained"."""
     higher = _higher([row], " runs")
     return f"{row.tier}; {higher}" if higher else row.tier
 
 
 def tiers_text(rows: Sequence[Row]) -> str:
-    """Return a sentence on the runs that reached a higher tier than their row has; empty if there is none."""
+    """Return a sentence on the runs that reached a higher tier than their row; empty if there is none."""
     higher = _higher(rows)
     return f"A row has the lowest tier of its runs. Runs with a higher tier: {higher}." if higher else ""
 

@@ -35,7 +35,7 @@ def markdown(board: Board, comparisons: Comparisons) -> str:
 
     Args:
         board: The board.
-        comparisons: What `compared.by_table` says of its rows.
+        comparisons: The comparisons of its rows, from `compared.by_table`.
     """
     averages = overall(board.rows)
     by_scenario = tables_of(board.rows)
@@ -63,7 +63,7 @@ def markdown(board: Board, comparisons: Comparisons) -> str:
 
 
 def _tied_text(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]]) -> str:
-    """Return which rows are told apart above plain fine-tuning, but not from its settings rated as highly."""
+    """Return sentences on rows above plain fine-tuning whose gain over its tied settings is not certain."""
     sides = certain_sides(rows, tied)
     found = [
         sentence

@@ -26,7 +26,7 @@ class Markdown(str):
 
 
 def template(module: str, name: str) -> Template:
-    """Return a template in the folder `templates` beside a module, which gives its `__file__`."""
+    """Return a template from the folder `templates` beside a module, whose `__file__` is `module`."""
     return _templates(Path(module).with_name("templates")).get_template(name)
 
 
@@ -74,7 +74,7 @@ def escaped(text: str) -> Markdown:
 
 
 def prose(text: str) -> Markdown:
-    """Return words of ours for Markdown: code in backticks stays, arXiv identifiers become links."""
+    """Return our own words as Markdown: code in backticks stays, arXiv identifiers become links."""
     parts = re.split(r"(`[^`]+`)", text)
     return Markdown("".join(part if part.startswith("`") else linked(escaped(part)) for part in parts))
 
@@ -95,7 +95,7 @@ def links(ids: Iterable[str]) -> Markdown:
 
 
 def code(text: str) -> Markdown:
-    """Return `text`, of ours, as code."""
+    """Return our own `text` as code."""
     return Markdown(f"`{text}`")
 
 

@@ -45,7 +45,7 @@ LEGEND = (
 """Legend below the tables."""
 
 TRIED = "Tried: settings that tuning tried. "
-"""Its part on scenarios whose stages end when the target is learned."""
+"""Part of the legend for scenarios whose stages end when the target is learned."""
 
 
 DROPPED_FIRST = (
@@ -78,7 +78,7 @@ class _Head:
     cell: Callable[[Any], str]
     """Returns the text in a row."""
     value: Callable[[Any], float | None] = lambda _: None
-    """Returns the number in a row, of which the best of a division is bold."""
+    """Returns the number in a row; the best number of a division is bold."""
     higher_is_better: bool | None = None
     stays: bool = False
     """Whether a narrow terminal keeps it."""
@@ -124,7 +124,7 @@ def terminal(table: Summary, width: int = 108, sort: str | None = None) -> Rende
 
 
 def _sorted(rows: list[RowSummary], metric: str | None) -> list[RowSummary]:
-    """Return the rows with those of each division from the best to the worst; rows without a value last."""
+    """Return the rows, each division from the best to the worst; rows without a value come last."""
     if metric is None:
         return rows
     sign = -1 if METRICS[metric].higher_is_better is False else 1
@@ -219,7 +219,7 @@ def _overall_heads(rows: Sequence[OverallRow]) -> list[_Head]:
 
 
 def _columns(rows: Rows, sort: str | None) -> list[Column]:
-    """Return the metrics that fit, and the one that the rows are sorted by."""
+    """Return the columns that fit, and the one by which the rows are sorted."""
     columns = list(fitting(rows))
     if sort is not None and sort not in {column.metric.name for column in columns}:
         columns.append(Column(METRICS[sort], column_title(sort, rows[0].to_criterion)))
@@ -227,7 +227,7 @@ def _columns(rows: Rows, sort: str | None) -> list[Column]:
 
 
 def _metric_heads(rows: Rows, sort: str | None = None) -> list[_Head]:
-    """Return the columns of these metrics."""
+    """Return the table's columns for the metrics of `_columns`."""
 
     def head(column: Column) -> _Head:
         name = column.metric.name

@@ -1,4 +1,4 @@
-"""Leftovers of killed processes, of which some are still being made."""
+"""Leftovers of killed processes, some of which are still being made."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""JSON from strangers: everything has a limit, and an error that names it."""
+"""JSON from strangers: everything has a limit, and the error names it."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Texts for people: what strangers wrote is shown, and does nothing."""
+"""Texts for people: words of strangers are shown, and have no other effect."""
 
 import io
 

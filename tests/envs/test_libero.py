@@ -1,4 +1,4 @@
-"""The LIBERO world: episodes that their seeds alone determine, in any order and on any worker."""
+"""The LIBERO world: episodes depend only on their seeds, in any order and on any worker."""
 
 import ast
 import hashlib

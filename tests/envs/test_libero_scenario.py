@@ -1,4 +1,4 @@
-"""The scenarios of LIBERO as data: what they have, also where the extra is missing."""
+"""The scenarios of LIBERO as data: what they contain, even where the extra is missing."""
 
 import importlib.metadata
 import re

@@ -1,4 +1,4 @@
-"""Answers to questions: they are counted by kind, whatever the number of the questions."""
+"""Answers to questions: they are counted by kind, for any number of questions."""
 
 from typing import Any, ClassVar
 

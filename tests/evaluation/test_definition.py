@@ -1,4 +1,4 @@
-"""The definition of a scenario: it changes with what a task is, and with nothing else."""
+"""The definition of a scenario: it changes when a task changes, and only then."""
 
 import dataclasses
 import sys

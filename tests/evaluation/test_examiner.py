@@ -1,4 +1,4 @@
-"""What the examiner writes about a policy that has diverged, though its weights are finite."""
+"""What the examiner writes about a policy that has diverged, although its weights are finite."""
 
 import dataclasses
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What the tests of faults share, and their counts: what they tried is as telling as that they passed."""
+"""What the tests of faults share, and their counts: what they tried tells as much as that they passed."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A Ray cluster that loses one part after another: the records are those of one machine all the same."""
+"""A Ray cluster that loses one part after another: the records still equal those of one machine."""
 
 import os
 import signal

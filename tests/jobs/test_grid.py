@@ -1,4 +1,4 @@
-"""`clbench.run`: a method from Python, also one that no other process can import."""
+"""`clbench.run`: a method from Python, even one that no other process can import."""
 
 import importlib
 import io

@@ -1,4 +1,4 @@
-"""Processes of jobs: what a job does to its process and begins beside it ends with the job."""
+"""Processes of jobs: what a job does to its process, and what it starts beside it, ends with the job."""
 
 import dataclasses
 import importlib

@@ -1,4 +1,4 @@
-"""Copies of the published records in folders of one's own."""
+"""Copies of the published records in folders of your own."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The hash of a record's content: the same for the same values, another for others."""
+"""The hash of a record's content: equal for equal values, different for different ones."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Dataclasses from JSON: each field is there, has its type and no other name."""
+"""Dataclasses from JSON: each field is there and has its type, and no other field is."""
 
 from dataclasses import dataclass
 from typing import Any, Literal

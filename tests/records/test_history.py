@@ -1,4 +1,4 @@
-"""Records of older schemas are read for good: `historic` holds real ones of each, as runs left them."""
+"""Records of older schemas stay readable: `historic` holds real ones of each, as runs left them."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Paths of records: every run has one of its own, inside the folder."""
+"""Paths of records: every run has a path of its own, inside the folder."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""The reader of records: a file that is no record is refused with its fault."""
+"""The reader of records: a file that is not a record is refused, and the error names its fault."""
 
 import json
 import re

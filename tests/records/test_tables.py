@@ -1,4 +1,4 @@
-"""Records as tables of pandas."""
+"""Records as pandas tables."""
 
 from collections.abc import Callable
 from pathlib import Path

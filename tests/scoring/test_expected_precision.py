@@ -1,4 +1,4 @@
-"""Quantiles, and the width to expect of intervals, against printed tables, simulations and closed forms."""
+"""Quantiles, and the expected width of intervals, against printed tables, simulations and closed forms."""
 
 import numpy as np
 import pytest

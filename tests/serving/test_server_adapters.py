@@ -1,4 +1,4 @@
-"""What the adapters of a server say of policies that return something else than they should."""
+"""What the adapters of a server say about policies that return something other than they should."""
 
 from typing import Any
 

@@ -2,7 +2,7 @@
 
 It reads one order per line, as JSON, from standard input, and answers each with a line: how many operations
 that change files the run began, and how it ended. Forking takes milliseconds; a new Python takes seconds to
-import PyTorch. What a run imports on its way is imported before: every fork took 2 s for it.
+import PyTorch. What a run imports on its way is imported beforehand: otherwise every fork spends 2 s on it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Names of policies: a kind, a size, or a class of one's own."""
+"""Names of policies: a kind, a size, or a class of your own."""
 
 import pytest
 

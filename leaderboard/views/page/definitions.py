@@ -22,7 +22,7 @@ OF_CURVES: Mapping[str, tuple[str, ...]] = {
     "transfer": ("forward_transfer", "forward_transfer_libero"),
     "average": ("area_under_curve_libero",),
 }
-"""Their members that need learning curves, which `DEFINITIONS` leaves out: a success matrix has none."""
+"""Members of these families that `DEFINITIONS` lacks: a success matrix has no learning curves."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def families(rows: Sequence[Row]) -> list[Family]:
     for family, title in FAMILIES.items():
         members = {metric for metric, one in DEFINITIONS.items() if one.family == family}
         members |= set(OF_CURVES.get(family, ()))
-        # the gain is a difference of final averages, and no definition of its own
+        # the gain is a difference of final averages, not a definition of its own
         metrics = [one for name, one in METRICS.items() if name in members and name != GAIN]
         metrics = [one for one in metrics if one.higher_is_better is not None]
         metrics = [one for one in metrics if any(row.estimates[one.name].value is not None for row in rows)]

@@ -136,7 +136,7 @@ def diagnostics(runs: Sequence[Run]) -> Diagnostics:
 
 
 def _mean(values: Sequence[Any]) -> tuple[str, str]:
-    """Return the mean over seeds as text and as a line; of values that are no numbers, what all have."""
+    """Return the mean over seeds as text and as a line; for values other than numbers, what all share."""
     if all(map(is_number, values)):
         return text_of(float(np.mean(values))), ""
     lengths = {

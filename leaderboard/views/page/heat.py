@@ -43,7 +43,7 @@ class HeatMap:
     scenarios: tuple[str, ...]
     """Names of the tables of scenarios with two or more competing methods."""
     rows: tuple[HeatRow, ...]
-    """Methods by division, those of most scenarios first."""
+    """Methods by division, those with the most scenarios first."""
 
 
 def heat_maps(tables: Mapping[str, Sequence[Row]]) -> list[HeatMap]:

@@ -82,11 +82,11 @@ def page(board: Board, comparisons: Comparisons) -> str:
 
     Args:
         board: The board.
-        comparisons: What `compared.by_table` says of its rows.
+        comparisons: The comparisons of its rows, from `compared.by_table`.
     """
     tables = sorted_tables(board)
     views = scenarios(tables, board, comparisons)
-    # the page waits for the library only to draw
+    # only drawing waits for the library
     scripts = [_source("choices.js"), _source("page.js"), _library()]
     maps = heat_maps(tables)
     style = _source("style.css") + _colours()
@@ -262,7 +262,7 @@ def _scenario_data(one: ScenarioView) -> dict[str, Any]:
 
 
 def _planes(one: ScenarioView, anchors: Mapping[str, str]) -> dict[str, Any]:
-    """Return what fills the template of the plane, by its two quantities."""
+    """Return the values that fill the template of the plane, by its two quantities."""
     planes = {
         f"{across.name}, {up.name}": Plane(one.table, across, up, anchors) for across in ACROSS for up in UP
     }

@@ -172,7 +172,7 @@ class RowView:
 
     @property
     def findings(self) -> list[Entry]:
-        """What others found who checked its runs."""
+        """What others found when they checked its runs."""
         checked = [run for run in self.row.runs if run.findings]
         if not checked:
             return []
@@ -186,8 +186,8 @@ class RowView:
 
 
 MAIN = (RANKED_BY, "gain", "adaptation", "retention", "kept_targets", "kept")
-"""Metrics that a table shows at once, with the same titles in every scenario. It shows its other columns when
-the reader asks for them."""
+"""Metrics that a table shows at first, with the same titles in every scenario. It shows its other columns
+when the reader asks for them."""
 
 
 def columns(rows: Rows) -> tuple[Column, ...]:
@@ -198,7 +198,7 @@ def columns(rows: Rows) -> tuple[Column, ...]:
 
 
 def others(rows: Rows) -> list[Metric]:
-    """Return the metrics that a table of `rows` does not show; the section of a row lists them apart."""
+    """Return the metrics that a table of `rows` does not show; the section of a row lists them separately."""
     there = {one.metric.name for one in columns(rows)}
     return [metric for metric in METRICS.values() if metric.name not in there]
 

@@ -82,7 +82,7 @@ class Runs:
 
     @property
     def numbered(self) -> bool:
-        """Whether targets are named by number, as the runs learned them in different orders."""
+        """Whether targets are named by number, because the runs learned them in different orders."""
         return any(one.layout.target != self.layout.target for one in self.scores)
 
     @property
@@ -97,7 +97,7 @@ class Runs:
         return self.layout.to_criterion
 
     def curves(self) -> Mapping[str, Sequence[Estimate]]:
-        """Return the points of `SERIES`, but for the last, with intervals."""
+        """Return the points of all `SERIES` but the last, with intervals."""
         first = self.records[0]
         generator = row_generator(self._place(first), f"{self._method(first)} curves")
         retained, target = SERIES[:2]
@@ -105,7 +105,7 @@ class Runs:
 
 
 def matrix_of(runs: Runs) -> Spec:
-    """Return the success matrix of runs, their mean."""
+    """Return the chart of the mean success matrix of runs."""
     layout = runs.layout
     groups = {
         "retained": tuple(map(printable, layout.retained)),
@@ -118,7 +118,7 @@ def matrix_of(runs: Runs) -> Spec:
 
 
 def curves_of(runs: Runs, sft: Runs | None) -> Spec:
-    """Return the curves of runs, with the old skills of plain fine-tuning if its runs are given."""
+    """Return the chart of the curves of runs, with plain fine-tuning's old skills if its runs are given."""
     steps = (1,) if runs.to_criterion else runs.layout.steps
     stages = range(len(runs.targets))
     at = {
@@ -146,7 +146,7 @@ def curves_of(runs: Runs, sft: Runs | None) -> Spec:
 
 
 def _point(series: str, place: tuple[int, int], length: int, one: Estimate) -> dict[str, Any]:
-    """Return a point of a curve; that of the targets begins anew in each stage."""
+    """Return a point of a curve; the curve of the targets begins anew in each stage."""
     stage, step = place
     when = f"step {step}" if length > 1 else ("start", "end")[step]
     return {

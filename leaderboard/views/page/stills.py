@@ -18,10 +18,10 @@ _NAME = re.compile(r"[A-Za-z0-9_]+")
 
 
 def stills(table: str, tasks: Iterable[str], cards: Path = CARDS) -> dict[str, str]:
-    """Return the stills of the tasks that have one, as data addresses by task.
+    """Return the stills of the tasks that have one, as data URLs by task.
 
     Args:
-        table: Name of a table, of the project's own scenarios or of another one, which has none.
+        table: Name of a table. Only tables of the project's own scenarios have stills.
         tasks: Names of its tasks; a stranger may have written them.
         cards: Folder of the cards.
     """
@@ -30,7 +30,7 @@ def stills(table: str, tasks: Iterable[str], cards: Path = CARDS) -> dict[str, s
 
 
 def film(table: str, cards: Path = CARDS) -> str | None:
-    """Return the film of a scenario as a data address; None if there is none, or for another policy.
+    """Return the film of a scenario as a data URL; None if there is none, or for another policy.
 
     Args:
         table: Name of a table.
@@ -40,7 +40,7 @@ def film(table: str, cards: Path = CARDS) -> str | None:
 
 
 def _picture(table: str, name: str, cards: Path) -> str | None:
-    """Return a file of a scenario's card as a data address; None if there is no such file."""
+    """Return a file of a scenario's card as a data URL; None if there is no such file."""
     scenario = table_parts(table)[0]
     if not _SCENARIO.fullmatch(scenario):
         return None

@@ -1,4 +1,4 @@
-"""The verdict of a scenario: what its rows say, in a few sentences and numbers."""
+"""The verdict on a scenario: what its rows say, in a few sentences and numbers."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Fact:
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """What a scenario says of one division."""
+    """What a scenario says about one division."""
 
     division_number: int
     """Place of the division in `DIVISIONS`."""
@@ -58,7 +58,7 @@ class Verdict:
 
 
 def headline(rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]] | None = None) -> str:
-    """Return what the rows of a scenario say of plain fine-tuning and the methods against forgetting.
+    """Return what the rows of a scenario say about plain fine-tuning and the methods against forgetting.
 
     Args:
         rows: The rows.
@@ -221,7 +221,7 @@ def _keeping(members: Sequence[Row], baseline: Row | None) -> str:
 
 
 def _beside(row: Row, baseline: Row) -> str:
-    """Return what a row learns, not told apart from plain fine-tuning in this, and what it keeps."""
+    """Return what a row, whose learning is not told apart from plain fine-tuning's, learns and keeps."""
     learned, kept = (
         f"{_value(name, row)} ({BASELINE} {_value(name, baseline)})" for name in ("adaptation", "kept")
     )

@@ -56,7 +56,7 @@ class ScenarioView:
     groups: Mapping[str, tuple[str, ...]]
     """Names of the tasks by group, targets in their published order."""
     tasks: Mapping[str, tuple[str, ...]]
-    """The same as heads of columns: targets by their place where each seed has its own order."""
+    """The same as column heads: targets are named by place where each seed has its own order."""
     balanced: bool
     """Whether each seed has its own order of the targets."""
     steps: tuple[int, ...]
@@ -92,7 +92,7 @@ class ScenarioView:
 
     @cached_property
     def verdicts(self) -> list[Verdict]:
-        """What its rows say of each division of methods."""
+        """What its rows say about each division of methods."""
         return verdicts(self.table, self.tied)
 
     @property
@@ -152,7 +152,7 @@ class ScenarioView:
 
     @property
     def has_single_seeds(self) -> bool:
-        """Whether a row has one seed alone."""
+        """Whether a row has only one seed."""
         return any(len(view.row.seeds) == 1 for view in self.rows)
 
     @property
@@ -224,7 +224,7 @@ def scenarios(tables: Mapping[str, list[Row]], board: Board, comparisons: Compar
     Args:
         tables: Rows of each scenario, in the order of the result.
         board: The board that they are from.
-        comparisons: What `compared.by_table` says of its rows.
+        comparisons: The comparisons of its rows, from `compared.by_table`.
     """
     found = []
     decoding = read_decoding()
@@ -260,7 +260,7 @@ def _printable(groups: Mapping[str, Iterable[str]]) -> dict[str, tuple[str, ...]
 
 
 def _other_policy(policy: str) -> list[str]:
-    """Return a sentence on a policy other than the default one, none for this or one that is not built in."""
+    """Return the sentence on a built-in policy other than the default one, none for any other policy."""
     if policy == DEFAULT_POLICY or not is_built_in(policy):
         return []
     size = size_of(policy)

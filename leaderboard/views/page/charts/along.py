@@ -26,10 +26,10 @@ def along_a_run(
 
     Args:
         targets: Titles of the stages.
-        steps: Optimiser steps of a stage; None if a stage ends when its target is learned, and is one long.
-        width: Width in pixels, or "container" for that of the place on the page.
+        steps: Optimiser steps of a stage; None if a stage ends when its target is learned, and has length 1.
+        width: Width in pixels, or "container" for the width of its place on the page.
         font: Font of all texts.
-        by_agent: Whether the run is of a policy that another program trained, for steps of its own.
+        by_agent: Whether another program trained the policy of the run, for a number of steps of its own.
     """
     length = steps or 1
     stages = [

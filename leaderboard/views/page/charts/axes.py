@@ -13,7 +13,7 @@ from ...format import bytes_text, format_interval, times_text
 from .vega import Spec, finite, rounded
 
 ROOM = 0.02
-"""Share of an axis before the first and behind the last mark."""
+"""Share of an axis before the first and after the last mark."""
 
 HIGHEST_LOW = 0.8
 """Highest low end of an axis of rates, so that differences of a few episodes do not look large."""
@@ -37,7 +37,7 @@ class Quantity:
 
     @property
     def is_bytes(self) -> bool:
-        """Whether it counts bytes, of which many rows have none: its axis has a place for zero."""
+        """Whether it counts bytes. Many rows have 0 bytes, so the axis has a place for zero."""
         return self.source == "bytes_kept"
 
     def of(self, row: RowSummary) -> Estimate:
@@ -74,7 +74,7 @@ UP = (KEPT, SKILLS, TARGETS)
 
 @dataclass(frozen=True)
 class Axis:
-    """An axis along which right, or up, is better: costs fall."""
+    """An axis along which right, or up, is better: costs fall along it."""
 
     quantity: Quantity
     low: float
@@ -106,7 +106,7 @@ class Axis:
         return max(one.low, low), min(one.high, high)
 
     def number(self, value: float | None) -> float | None:
-        """Return a value for the chart. A cost has four digits: the axis is logarithmic, and 0 not on it."""
+        """Return a value for the chart. A cost has four digits: its axis is logarithmic, without 0."""
         known = finite(value)
         return float(f"{known:.4g}") if self.quantity.is_cost and known is not None else rounded(known)
 
@@ -147,7 +147,7 @@ class Axis:
         return {"format": ".2~f", "tickCount": 5}
 
     def title(self, is_long: bool) -> str:
-        """Its title."""
+        """Return the title of the axis."""
         name = self.quantity.name + (", less is better" if self.quantity.is_cost else "")
         return f"{name}: {self.quantity.meaning}" if is_long else name
 

@@ -1,8 +1,8 @@
 """The frontier as Vega-Lite: what methods learn and keep along the ladder of learning rates.
 
-Each method has a panel with the line of plain fine-tuning in it: all lines in one picture would be a knot.
-Methods with prior demonstrations may keep so much more than the others that their panels have axes of their
-own.
+Each method has a panel with the line of plain fine-tuning in it: all lines in one picture would be a tangle.
+Methods with prior demonstrations may keep so much more than other methods that their panels have their own
+axes.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ STEPS = (0.05, 0.1, 0.2, 0.25)
 """Possible distances of two ticks; axes begin and end at a multiple of the first."""
 
 PARTS = 4
-"""Most parts of an axis between ticks: there is room for so many labels."""
+"""Most parts of an axis between ticks: there is room for this many labels."""
 
 ROOM = 0.01
 """Least distance of a mark from the ends of its axis."""
@@ -81,7 +81,7 @@ def frontier(curves: Sequence[Curve], size: Size, font: str = SYSTEM_FONT) -> Sp
 
 
 def _points(curve: Curve) -> Points:
-    """Return the marks of a curve, those of known values."""
+    """Return the marks of a curve whose values are known."""
     return [
         {
             "method": curve.method,
@@ -138,7 +138,7 @@ def _look(points: Points, size: Size) -> Spec:
 def _group(
     title: str, members: Sequence[tuple[Curve, Points]], baseline: Points, look: Spec, size: Size
 ) -> Spec:
-    """Return the panels of some curves, which share their axes; names of axes stand at the edge alone."""
+    """Return the panels of some curves, which share their axes; axes are named only at the edge."""
     shown = [*baseline, *(one for _, points in members for one in points)]
     ends = {name: _ends(one[name] for one in shown) for name in "xy"}
     panels = []
@@ -165,7 +165,7 @@ def _name(method: str, size: Size) -> Spec:
 
 
 def _drawn(points: Points, x: Spec, y: Spec, look: Spec, is_baseline: bool = False) -> list[Spec]:
-    """Return the layers of a line. The baseline comes last; smaller marks leave those below them in sight."""
+    """Return the layers of a line. The baseline comes last; its smaller marks leave those below in sight."""
     if not points:
         return []
     tooltip = [{"field": name} for name in ("method", "learning rate", "learned", "kept", "seeds")]

@@ -126,7 +126,7 @@ def _overlap(one: Box, other: Box) -> bool:
 
 
 def _spread(wished: Sequence[float], height: float) -> list[float]:
-    """Return positions near the wished ones, in rising order, at least `HEIGHT` apart."""
+    """Return positions near the desired ones, in rising order, at least `HEIGHT` apart."""
     places: list[float] = []
     for wish in wished:
         places.append(max(wish, places[-1] + HEIGHT if places else 0.0))

@@ -29,7 +29,7 @@ class Plot:
     """A chart. Notebooks show it, and `save` writes it."""
 
     spec: Spec
-    """The chart in Vega-Lite, which other programs draw, too."""
+    """The chart in Vega-Lite, which other programs can draw, too."""
 
     def svg(self) -> str:
         """Return the chart as SVG."""
@@ -56,7 +56,7 @@ class Plot:
 
 
 def on_paper(spec: Spec) -> Plot:
-    """Return a chart with a background, its colours still the names of `PALETTE`."""
+    """Return a chart with a background, whose colours are still the names of `PALETTE`."""
     return Plot({**spec, "config": {**spec["config"], "background": colour("paper")}})
 
 

@@ -1,7 +1,8 @@
 """The plane of a scenario: what methods keep against what they learn, or what they cost.
 
-The page lets readers choose both axes and hide methods. So a plane has two parts: a template, which depends
-on its size alone, and what fills its places, texts that begin with "@", for two quantities.
+The page lets readers choose both axes and hide methods. A plane therefore has two parts: a template, which
+depends only on its size, and the values that fill the template's places for two quantities. Places are texts
+that begin with "@".
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ NARROW = Size(205, 320, 2)
 """Size on a phone."""
 
 MEANING = "Thin lines: 95 % intervals, cut off at the edge. Dashed lines: Pareto front of a division."
-"""What the marks do not say themselves."""
+"""What the marks themselves do not say."""
 
 
 def plane(rows: Sequence[RowSummary], size: Size, title: str = "") -> Spec:
@@ -124,14 +125,14 @@ class Plane:
 
     @property
     def places(self) -> dict[str, Any]:
-        """What fills the template at any size: points and axes."""
+        """Values that fill the template at any size: points and axes."""
         axes: dict[str, Any] = {}
         for name, one in (("x", self.across), ("y", self.up)):
             axes |= {f"@{name} scale": one.scale, f"@{name} marks": one.marks}
         return {**axes, "@points": self.points, "@corners": self.corners}
 
     def labels(self, size: Size) -> dict[str, Any]:
-        """Return what else fills it: titles of the axes and, in pixels, labels and lines to some of them."""
+        """Return the values that depend on the size: titles of the axes, labels, and lines to some labels."""
         marks = [self._mark(point, size) for point in self.points]
         rows = {round((1 - self.up.share(corner["y"])) * size.height, 3) for corner in self.corners}
         labels = place(marks, sorted(rows), size.width, size.height)

@@ -1,4 +1,4 @@
-"""What all charts share: colours, fonts and the parts of a specification of Vega-Lite.
+"""What all charts share: colours, fonts and the parts of a Vega-Lite specification.
 
 Colours are names of `PALETTE`, written as CSS variables, so that a chart follows the theme of the page
 without a new drawing. In a picture, the colours of one theme replace them.
@@ -43,7 +43,7 @@ LETTER = 6
 """Mean width of a letter of a subtitle in pixels."""
 
 Spec = dict[str, Any]
-"""A specification of Vega-Lite."""
+"""A Vega-Lite specification."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def heading(text: str) -> Spec:
 
 
 def subtitle(texts: Iterable[str], width: int) -> Spec:
-    """Return what adds texts below a title, in lines that fit a width in pixels."""
+    """Return the part of a title that adds texts below it, in lines that fit a width in pixels."""
     lines = [line for text in texts for line in wrap(text, width // LETTER)]
     return {"subtitle": lines, "subtitleColor": colour("muted"), "subtitleFontSize": 12}
 
@@ -119,7 +119,7 @@ def axis(name: str, title: str, **rest: Any) -> Spec:
 
 
 def rounded(value: float | None) -> float | None:
-    """Return a number for a chart. Rounded twice, so that the last bit of a sum does not show."""
+    """Return a number for a chart. It is rounded twice, to hide the last bit of a sum."""
     known = finite(value)
     return None if known is None else round(round(known, 9), 3) + 0.0
 

@@ -1,4 +1,4 @@
-"""The verdict of a scenario: sentences that hold for any records, and call nothing best that is not."""
+"""The verdict on a scenario: its sentences hold for any records, and call nothing best that is not."""
 
 import dataclasses
 import re
