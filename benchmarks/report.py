@@ -21,12 +21,12 @@ INTRODUCTION = """\
 Ratios compare blocks that take turns on one machine: the median over rounds, with a 95 % bootstrap interval,
 or with the lowest and the highest value where there are fewer than six rounds. Seconds depend on that machine
 and cannot be compared with another machine's. The machine was otherwise idle, except during LIBERO's steps
-and some whole runs, when others used a part of it.
+and some whole runs, when other programs used part of it.
 """
 TRIED = """\
 ## What was tried
 
-Each change was measured once, in turns with the present code, on two cores of an AMD EPYC, in most cases
+Each change was measured once, alternating with the present code, on two cores of an AMD EPYC, in most cases
 without AVX-512.
 
 | change | result | kept |
@@ -91,11 +91,11 @@ def _rollouts() -> Iterator[str]:
     yield (
         f"Speed of `gym.make_vec(id, num_envs={num_envs})` with {threads} threads, as a multiple of common "
         "vector environments on the suite's own environment, and of `mj_step` alone on as many threads, "
-        "which is the limit. On LIBERO it is no limit: there it steps LIBERO's whole model, visual geoms "
-        "included, and the arm stands still. Of dm_control's three bodies, the row has the ball in "
-        "a cup, whose rewards are computed together; ours holds the cup to the right. Steps per second are "
-        "those of all environments together. Rows may come from different machines: compare ratios, not "
-        "steps."
+        "which is the upper limit. On LIBERO it is not: there, `mj_step` steps LIBERO's whole model, "
+        "including the visual geoms, with the arm at rest. Of dm_control's three bodies, the row measures "
+        "the ball in a cup, whose rewards are computed together; in our task, the cup is held to the right. "
+        "Steps per second are the steps of all environments together. Rows may come from different machines: "
+        "compare ratios, not steps."
     )
     yield ""
     one_thread = "clbench, one thread"
