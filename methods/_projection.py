@@ -1,4 +1,4 @@
-"""Operations on blocks of gradients: A-GEM's one-sided projection, and random directions for controls."""
+"""Operations on blocks of tensors: A-GEM's one-sided projection, and random directions for controls."""
 
 from collections.abc import Sequence
 

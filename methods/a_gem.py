@@ -6,8 +6,8 @@ layer by layer, against the gradient of a distance between hidden states.
 
 Details:
 1. The memory holds all prior demonstrations, as in experience replay. A batch from the memory has the
-   budget's size and is added to the target's batch, so a step reads twice as many samples as a step of
-   experience replay.
+   budget's size and is drawn in addition to the target's batch, so a step reads twice as many samples as a
+   step of experience replay.
 2. There is one projection for all weights together.
 3. If there is no earlier task, the gradient on the target is not changed.
 4. The projected gradient is clipped and goes through Adam, whose step may still raise the prior loss; the

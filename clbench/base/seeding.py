@@ -1,4 +1,4 @@
-"""Seeds by name: a random stream depends on its purpose alone, never on the code that ran before."""
+"""Seeds by name: a random stream depends on its name alone, never on the code that ran before."""
 
 from __future__ import annotations
 

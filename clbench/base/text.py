@@ -37,7 +37,7 @@ def printable_lines(text: str) -> str:
 
 
 def shortened(text: str, whole: str) -> str:
-    """Return a text as it is, or if longer than `LONGEST_SHOWN` its beginning and where the whole text is."""
+    """Return a text of up to `LONGEST_SHOWN` characters as it is, else its start and where the rest is."""
     return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]} [... {whole} has the rest]"
 
 

@@ -67,8 +67,8 @@ def tune(
     run, for example because the loss diverged, is not chosen. Runs with a record are skipped: repeat a
     stopped command to continue it, or to see the choice again.
 
-    With --values, plain fine-tuning and the methods run, the methods with every combination of these values,
-    and nothing is chosen.
+    With --values, the methods run with every combination of these values instead, plain fine-tuning runs
+    beside them, and nothing is chosen.
 
     Args:
         scenario: Gymnasium id of the scenario; module:id imports the module first.

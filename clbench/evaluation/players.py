@@ -138,8 +138,8 @@ def play(
         seed: Seed of the run; it chooses the initial states.
         instruction: Form of the instruction in observations.
         batched: Whether the agent acts on `LANES` observations at once, always the same number, since another
-            number of rows may round differently. Such an agent may have no memory. Any other agent plays one
-            episode after another.
+            number of rows may round differently. Such an agent must not return a memory. Any other agent
+            plays one episode after another.
 
     Raises:
         InputError: An action has the wrong shape, an agent that acts on batches returned a memory, or an

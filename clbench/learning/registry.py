@@ -138,7 +138,7 @@ def new_method(spec: str, cls: type[Method], values: Mapping[str, Any]) -> Metho
 
 
 def _held(name: str, value: Any, hint: Any) -> Any:
-    """Return a value as a field of the type `hint` holds it: 5 becomes 5.0 if the type has no int."""
+    """Return a value as a field of the type `hint` holds it: 5 becomes 5.0 for a float without an int."""
     kinds = _kinds(hint)
     items = [get_args(kind) for kind in kinds if get_origin(kind) is list]
     if items and isinstance(value, list):

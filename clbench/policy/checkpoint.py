@@ -94,7 +94,7 @@ def _kinds(tensors: Mapping[str, Tensor]) -> dict[str, tuple[Any, ...]]:
 
 
 def _fault(config: PolicyConfig, tensors: Mapping[str, Tensor], kind: str | None) -> str | None:
-    """Return why a policy of these sizes must not be built, for example for lack of memory, else None."""
+    """Return why a policy of these sizes must not be built, else None: it could exceed the memory."""
     sizes = dataclasses.asdict(config)
     allowed = list(POLICIES) if kind is None else [kind]
     if sizes.pop("kind") not in allowed:

@@ -55,8 +55,8 @@ def read_record(path: Path | str) -> Record:
     checks whether its values agree with each other.
 
     Raises:
-        RecordError: The file is not a regular file of JSON within the limits, is of an unknown schema, has a
-            field that is missing, unknown or of another type, has columns that do not fit together, or does
+        RecordError: The file is not a regular file of JSON within the limits, is of an unknown schema, lacks
+            a field, has an unknown one or one of another type, has columns that do not fit together, or does
             not match the hash of its content.
     """
     try:

@@ -171,7 +171,7 @@ class RunInfo:
     """Order in which the targets were learned; 0 is the published one. See
     `clbench.spec.scenario.target_order`."""
     perturb: bool = False
-    """Whether the retained skills were also evaluated on perturbed episodes."""
+    """Whether the retained skills and each stage's target were also evaluated on perturbed episodes."""
     policy: str = DEFAULT_POLICY
     """Name of the policy."""
 

@@ -47,10 +47,10 @@ def write_record(record: Record, path: Path) -> None:
 
 
 def write_result(record: Record, path: Path) -> None:
-    """Write the record of a run, but keep an earlier record whose run succeeded, or may have succeeded.
+    """Write the record of a run, but lose no record of a run that succeeded, or may have succeeded.
 
-    If this run failed, such an earlier record stays in its place. If the earlier record has other settings,
-    another budget or another device, its file is kept next to the new one, with the ending ".old".
+    If this run failed, such a record stays in its place. If it has other settings, another budget or another
+    device, its file is kept next to the new one, with the ending ".old". An equal run replaces it.
 
     Raises:
         InputError: As for `write_record`.

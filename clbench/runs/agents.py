@@ -278,7 +278,7 @@ class StagedRun:
             raise InputError(f"{told}: choose another seed or name, or remove it.")
 
     def plan(self, stage: int, again: bool) -> Record | None:
-        """Return the record so far, after checking that a stage may be evaluated now.
+        """Return the record so far, after checking that a stage comes next or has been evaluated.
 
         Args:
             stage: Stage to evaluate.
@@ -407,7 +407,7 @@ class StagedRun:
         record.timing["seconds"] = None if None in parts else round(sum(parts), 2)
 
     def keep(self, record: Record, stage: int) -> None:
-        """Write the record beside its final path; after the last stage, write it there and end the run.
+        """Write the record: beside its final path, or after the last stage to that path, which ends the run.
 
         Raises:
             LeaseLostError: Another process took over the run.

@@ -5,9 +5,9 @@ episodes:
 
 1. `RUNGS`: four factors of the learning rate, with the method's own strength at its default.
 2. Two more settings at the best of these rungs: two other values of the strength that the method declares in
-   `Method.tunes` or, if it declares none, two learning rates on either side of the rung. Next to the lowest
-   and the highest rung, one of the two lies outside the ladder: such a method may try 0.0165, which others
-   cannot.
+   `Method.tunes` or, if it declares none, two learning rates, one on each side of the rung. Next to the
+   lowest and the highest rung, one of the two lies outside the ladder: such a method may try 0.0165, which
+   others cannot.
 
 Among the settings whose success on the targets right after learning is at least `LEARNED`, the one with the
 best final average wins. A hyper-parameter that the scenario determines, such as the length of a schedule, is

@@ -238,7 +238,7 @@ def _is_address(text: str) -> bool:
 
 
 def _without_password(address: str) -> str:
-    """Return an address without user and password, even a damaged one: passwords hold any character."""
+    """Return an address without user and password, even a damaged one: passwords may hold any character."""
     return re.sub(r"^(\w+://)?.*@", r"\1", address, flags=re.DOTALL)
 
 

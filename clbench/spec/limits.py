@@ -18,5 +18,5 @@ class Limits:
     memory: int = 8 * 1024**3
     """Resident memory at any one time, in bytes."""
     written: int = 4 * 1024**3
-    """Bytes that the process asks the system to write, to any file. Not measured on macOS, which does not
-    count them."""
+    """Bytes that the process asks the system to write, wherever to: files, pipes or a terminal. Not measured
+    on macOS, which does not count them."""

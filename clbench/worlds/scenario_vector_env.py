@@ -227,7 +227,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         return self._observation(self._everywhere), rewards, terminated, truncated, info
 
     def _finished(self, numbers: list[int], successes: Flags) -> dict[str, Any]:
-        """Begin the next episodes of the environments `numbers`; return the final infos of the ended ones."""
+        """Begin the next episodes of `numbers`; return the final observations and infos of the ended ones."""
         shown = self._observation(numbers)
         info: dict[str, Any] = {}
         for row, number in enumerate(numbers):

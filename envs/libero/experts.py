@@ -200,7 +200,7 @@ def _put(
         state: The state (213,).
         grip: Grasp of the thing.
         support: Name of the other thing.
-        offset: Goal of the thing, along the other thing's own axes.
+        offset: Goal of the thing, from the other thing along its own axes.
         clearance: Height in metres above the goal from which the thing comes down.
     """
     sight = Sight(state)
@@ -251,7 +251,7 @@ def _push_plate(state: State) -> Action:
 
 TOP, MIDDLE = 0, 1
 BARS = (-0.0028, -0.1016, 0.184), (-0.0028, -0.1016, 0.1104)
-"""Places of the handles of the top and the middle drawer, along the cabinet's own axes."""
+"""Places of the handles of the top and the middle drawer, from the cabinet along its own axes."""
 
 
 def _bar(sight: Sight, drawer: int) -> Vector:
@@ -275,7 +275,7 @@ def _open(state: State, drawer: int) -> Action:
 
 
 INSIDE = (0.0033, 0.0113, 0.2)
-"""Goal of the bowl in the closed top drawer, along the cabinet's own axes."""
+"""Goal of the bowl in the closed top drawer, from the cabinet along its own axes."""
 
 
 def _open_and_put(state: State) -> Action:

@@ -36,7 +36,7 @@ class Scene:
     xml: str
     """The scene in MJCF."""
     model: mujoco.MjModel
-    """The scene without unused sensors, and without the parts that are only seen: 95 % of its memory."""
+    """The scene without unused sensors, and without the parts that are only seen, 95 % of the full memory."""
     models: Copies[mujoco.MjModel]
     """The model, for threads that advance episodes at the same time: each moves the fixtures in its own."""
     places: Places

@@ -54,7 +54,7 @@ class Row(RowSummary):
     orders: Orders
     """Its results with the targets in this and in other orders."""
     height: float | None
-    """Value that orders the rows of a division, higher first: `_heights`; None without a final average."""
+    """Value that orders the rows of a division, higher first (`_heights`); None without a final average."""
 
     @property
     def scores(self) -> Runs:

@@ -301,7 +301,7 @@ def same_definition(runs: list[Run]) -> Sifted:
 
 
 def unlike_the_pin(run: Run, moves: bool = False) -> str:
-    """Return in words where the definition of a run differs from the pinned one; empty if it does not.
+    """Return in words where a run of a project's scenario differs from the pin; empty if it does not.
 
     If its worlds may move differently (`moves`), tasks and questions do not count: they come from episodes.
     """

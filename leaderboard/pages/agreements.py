@@ -114,7 +114,8 @@ def _shares_of_variance(name: str, rows: Sequence[Row]) -> Iterator[str]:
     """Yield the shares of the variance of the final average that the method and the seed explain.
 
     The shares are omega squared of the table of methods and seeds: sums of squares minus what noise alone
-    adds to them (Hays 1963). For equal methods they are 0 on average, before negative values become 0.
+    adds to them (Hays 1963). For equal methods, the share of the method is 0 on average, before negative
+    values become 0.
 
     Args:
         name: Name of the scenario.

@@ -390,13 +390,13 @@ def _policies(board: Board) -> Section:
             lower = sum(one.is_below(0) for one in apart)
             higher = sum(one.is_above(0) for one in apart)
             answers.append(
-                f"On {scenario} with {policy}, {lower} of {counted(len(apart), 'method')} "
+                f"On {scenario} with {policy}, by their own intervals (not corrected for "
+                f"{counted(len(apart), 'comparison')}), {lower} of {counted(len(apart), 'method')} "
                 f"{'has' if lower == 1 else 'have'} a lower kept share than with the flow policy, and "
-                f"{higher} {'has' if higher == 1 else 'have'} a higher one. Each method is judged by its own "
-                f"interval, without correction for {counted(len(apart), 'comparison')}. The methods have the "
-                "settings that were tuned for the flow policy, and their stages take different numbers of "
-                "steps, so tuning may explain a difference. So may learning: what was never learned cannot "
-                "be forgotten."
+                f"{higher} {'has' if higher == 1 else 'have'} a higher one. The methods have the settings "
+                "that were tuned for the flow policy, and their stages take different numbers of steps, so "
+                "tuning may explain a difference. So may learning: what was never learned cannot be "
+                "forgotten."
             )
         elif comparisons:
             answers.append(

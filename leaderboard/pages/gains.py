@@ -78,7 +78,7 @@ def gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[T
             f"On {name}, no method is above plain fine-tuning and told apart from it: {which} "
             f"{format_interval(gains[best], '.3f')}. {_power(rows, gains)}"
         )
-    alone = "by its own interval only"
+    alone = "only by the interval of the gain itself"
     if len(gains) > 1:
         alone += f" (not corrected for {len(gains)} comparisons)"
     higher = {method: gain for method, gain in gains.items() if gain.is_above(0) and method not in better}
@@ -89,7 +89,7 @@ def gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[T
         yield f"On {name}, above plain fine-tuning {alone}: {_listed(over_both)}."
     if len(over_both) < len(higher):
         rest = {method: gain for method, gain in higher.items() if method not in over_both}
-        yield f"On {name}, above plain fine-tuning at its chosen setting only, and {alone}: {_listed(rest)}."
+        yield f"On {name}, above only the setting that tuning chose for sft, and {alone}: {_listed(rest)}."
     losses = _losses(gains)
     worse = {method: loss for method, loss in losses.items() if method in apart}
     if worse:

@@ -215,8 +215,8 @@ def _doubts(method: str) -> list[str]:
     ends: list[tuple[str, str]] = []
     for scenario, found in _tunings(method):
         sentences += [
-            f"On {scenario}, {_words(one.settings, '`{}`')} ties with the chosen setting; it was tried "
-            "later, so it has no row on the board."
+            f"On {scenario}, {_words(one.settings, '`{}`')} ties with the chosen setting but was "
+            "tried later, so it has no row on the board."
             for one in rated_best(found.tried)
             if one.settings != found.settings
         ]

@@ -177,7 +177,7 @@ class Card:
     def _of_runs(
         self, row: Row, quantity: Callable[[Rates], Array], span: tuple[float, float] = (0, 1)
     ) -> Estimate:
-        """Return the mean of a quantity (..., runs) over the runs of a row, such as of how they begin."""
+        """Return the mean of a quantity (..., runs) over the runs of a row; most are about how runs begin."""
         generator = row_generator(self.scenario.id, f"pretrained {quantity.__name__}")
         runs = {"one": list(row.scores.values())}
         return bootstrap(lambda of: average(quantity(of["one"])), runs, generator, span=span)

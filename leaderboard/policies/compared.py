@@ -30,7 +30,7 @@ class Comparison:
     seeds: int
     """Number of seeds that both have."""
     estimates: Mapping[str, tuple[Estimate, Estimate, Estimate]]
-    """By metric: with the default policy, with the other one, and the second minus the first, by seed."""
+    """By metric: with the default policy, with the other one, and their difference, paired by seed."""
 
 
 def compare_policies(rows: Sequence[Row], others: Sequence[Row]) -> tuple[Comparison, ...]:

@@ -63,7 +63,7 @@ def markdown(board: Board, comparisons: Comparisons) -> str:
 
 
 def _tied_text(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]]) -> str:
-    """Return sentences on rows above plain fine-tuning whose gain over its tied settings is not certain."""
+    """Return sentences on rows told apart above plain fine-tuning, but not certainly above tied settings."""
     sides = certain_sides(rows, tied)
     found = [
         sentence

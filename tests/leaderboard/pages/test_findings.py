@@ -78,7 +78,7 @@ def test_a_difference_that_is_certain_only_without_counting_the_comparisons_is_s
         "no method is above plain fine-tuning and told apart from it: the largest gain of 9 methods is that "
         "of `finch`, 0.0"
     ) in text
-    alone = "by its own interval only (not corrected for 9 comparisons)"
+    alone = "only by the interval of the gain itself (not corrected for 9 comparisons)"
     assert f"above plain fine-tuning {alone}: `finch` by 0.0" in text
     assert f"below plain fine-tuning {alone}: `lora` by 0.0" in text
 

@@ -304,7 +304,7 @@ def test_a_setting_that_ties_with_the_chosen_one_is_told(
     )
     pages = bench.pages()
     assert [line for line in pages["finch"].splitlines() if " ties " in line] == [
-        "On clbench/MetaWorld-v1, `kappa` = 0.3, `step_factor` = 0.1 ties with the chosen setting; it was "
+        "On clbench/MetaWorld-v1, `kappa` = 0.3, `step_factor` = 0.1 ties with the chosen setting but was "
         "tried later, so it has no row on the board."
     ]
     assert " ties " not in pages["sft"]
