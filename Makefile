@@ -102,6 +102,7 @@ ladder: .venv/installed-libero
 	$(BIN)/clbench run clbench/Fetch-v1 sft --set.step_factor 0.1 --seeds 12 --records leaderboard/ladder
 	$(BIN)/clbench run $(CLAIMED) consft_calibrated --set.step_factor 1 --seeds 4 --records leaderboard/ladder
 	$(BIN)/clbench run clbench/PointMaze-v1 sft consft fast_dvla --set.step_factor 1 --seeds 4 --records leaderboard/ladder
+	$(BIN)/clbench run clbench/LiberoSpatial-v1 sft $(SCHEDULED) --set.step_factor 1 --seeds 4 --records leaderboard/ladder
 
 # Further records for docs/reference/claims.md: methods with one change that shows what causes their effect.
 KNOWLEDGE := clbench/FetchKnowledge-v1
