@@ -323,7 +323,7 @@ def _placed(found: list[Path], records: Path) -> tuple[list[Path], Path]:
     for path in absolute:
         if not path.is_relative_to(folder):
             raise InputError(
-                f"{path} is not below {folder}: give --records the folder in which it is "
+                f"{path} is not below {folder}: set --records to the folder in which the record is "
                 "SCENARIO/METHOD/seed-N.json."
             )
         in_place = len(path.relative_to(folder).parts) == 3  # then the verification reads it, and not this

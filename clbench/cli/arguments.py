@@ -102,7 +102,7 @@ def items_of(option: str, text: str) -> list[str]:
     """
     items = [item.strip() for item in text.split(",")]
     if "" in items:
-        raise InputError(f"{option} has an empty item: {text!r}. Write names with a comma between them.")
+        raise InputError(f"{option} has an empty item: {text!r}. Separate items with single commas.")
     return list(dict.fromkeys(items))
 
 
@@ -120,7 +120,7 @@ def chosen_methods(methods: Iterable[str], every: bool) -> list[str]:
 
     names = list(dict.fromkeys([*methods, *(method_names() if every else ())]))
     if not names:
-        raise InputError("Name at least one method, or --all; `clbench list` shows them.")
+        raise InputError("Name at least one method, or use --all; `clbench list` shows all methods.")
     return names
 
 
@@ -164,7 +164,7 @@ def parsing_error(error: CycloptsError) -> Text:
     if token is not None and token.keyword in BY_NAME:
         name, _, value = token.value.partition("=")
         example = f"{token.keyword}.{name if name.isidentifier() else 'NAME'} {value or 'VALUE'}"
-        return error_line(f"The name belongs to the option: write {example}")
+        return error_line(f"The name is part of the option: write {example}")
     return error_line(error)
 
 

@@ -181,8 +181,8 @@ def score(
     """
     check_names([scenario], [])
     with checked_input():
-        require("websockets", "serve", "A policy of another program")
-        require("msgpack", "serve", "A policy of another program")
+        require("websockets", "serve", "Scoring a served policy")
+        require("msgpack", "serve", "Scoring a served policy")
     from clbench.jobs.bars import Bars
     from clbench.runs.agents import UNFINISHED
     from clbench.serving.client import ServedPolicy
@@ -223,7 +223,7 @@ def score(
     elif record.run.split == "test":
         then = f"Record: {path}\n{_next(records)}"
     else:
-        then = f"Record: {path}\nIt is a tuning run, on validation episodes: no board shows it."
+        then = f"Record: {path}\nThis is a tuning run on validation episodes, so no board shows it."
     print_plain(console, then)
 
 

@@ -137,4 +137,4 @@ def check_new_name(name: str, kind: str) -> None:
         raise InputError(f"{name!r} is a Python keyword. Did you mean {f'{name}_{kind}'!r}?")
     check_method_name(name)
     if find_spec(name) is not None:
-        raise InputError(f"There is a module {name!r} already. Did you mean {f'{name}_{kind}'!r}?")
+        raise InputError(f"A module named {name!r} already exists. Did you mean {f'{name}_{kind}'!r}?")

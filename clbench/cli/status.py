@@ -122,8 +122,8 @@ def status(
             given = [name for name, value in options if value != NOT_GIVEN[name]]
             given += [f"--set.{name}" for name in changes or {}]
             if given:
-                chosen = f"{listed(given)} {'chooses' if len(given) == 1 else 'choose'}"
-                raise InputError(f"{chosen} among the runs of a scenario: name the scenario first.")
+                chosen = f"{listed(given)} {'needs' if len(given) == 1 else 'need'}"
+                raise InputError(f"{chosen} a scenario: name the scenario first.")
             paths = found_runs(records)
             if not paths:
                 raise InputError(f"There are no runs in {records}: `clbench run` makes them.")

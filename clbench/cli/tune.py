@@ -146,9 +146,9 @@ def _check_together(
         InputError: Two of them do; the message names both.
     """
     if targets is not None and not values:
-        raise InputError("--targets needs --values: settings are chosen on all targets.")
+        raise InputError("--targets needs --values: without --values, settings are chosen on all targets.")
     if write is not None and values:
-        raise InputError("--write cannot be used with --values: it needs a choice of settings.")
+        raise InputError("--write cannot be used with --values, which chooses no settings.")
     if write is not None and first_seed < FIRST_TUNING_SEED:
         raise InputError(
             f"--write needs seeds that no board has: --first-seed must be at least {FIRST_TUNING_SEED}, "
@@ -209,7 +209,7 @@ def _without_controls(names: list[str], controls: Mapping[str, str], every: bool
     if own != names and not every:
         name = next(name for name in names if name in controls)
         raise InputError(
-            f"{name} is a control of {controls[name]} and has its settings: tune {controls[name]}."
+            f"{name} is a control of {controls[name]} and uses its settings: tune {controls[name]} instead."
         )
     return own
 
@@ -265,7 +265,7 @@ def _tried(runs: Sequence[ResolvedRun], records: Path) -> Tried:
         values = [measure(metric, one) for one in scores]
         known = [value for value in values if value is not None]
         if len(known) < len(values):
-            raise InputError(f"{metric} has no value on {runs[0].scenario.id}: nothing can be chosen by it.")
+            raise InputError(f"{metric} has no value on {runs[0].scenario.id}: it cannot rank settings.")
         return round(sum(known) / len(known), 4)
 
     return Tried(dict(runs[0].changes), mean("final_average"), mean("adaptation"))

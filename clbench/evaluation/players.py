@@ -171,9 +171,9 @@ def _check_wrappers(agent: Agent, scenario: Scenario, instruction: InstructionFo
     if not (observes and acts):
         other = " and ".join(compress(("observations", "actions"), (not observes, not acts)))
         raise InputError(
-            f"The agent learned with other {other} than those of {scenario.id} with "
+            f"The agent was trained with {other} that differ from those of {scenario.id} with "
             f"instruction={instruction!r}, for example behind a wrapper. Evaluate an object whose predict() "
-            "does what the wrapper did, as docs/guide/online.md shows."
+            "does the same as the wrapper, as docs/guide/online.md shows."
         )
 
 

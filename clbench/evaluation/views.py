@@ -70,7 +70,7 @@ class Views:
         common = set.intersection(*names) - {""}
         for name in self.cameras:
             if not common:
-                raise InputError(f"There is no camera {name!r}: the scenes of the tasks have none in common.")
+                raise InputError(f"There is no camera {name!r}: the scenes of the tasks share no camera.")
             if name not in common:
                 raise unknown("camera in the scenes of all tasks", name, common)
         if self.size > min(sizes):

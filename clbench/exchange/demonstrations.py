@@ -105,7 +105,7 @@ def check_output(output: Path | str, kind: str, tasks: Sequence[Task]) -> Path:
     for task in {task.world: task for task in tasks}.values():
         steps_per_second(task)
     if os.path.lexists(output):
-        raise InputError(f"{output} exists: an export makes a new folder.")
+        raise InputError(f"{output} already exists: name a new folder for the export.")
     return Path(output)
 
 
@@ -125,8 +125,8 @@ def _warn_if_constant(tasks: Iterable[Sequence[Demonstration]]) -> None:
     constant = np.flatnonzero(np.ptp(actions, axis=0) == 0)
     if constant.size:
         LOG.warning(
-            "These numbers of the actions are the same in every step of this export: %s, counted from 0. A "
-            "policy that is normalised with the statistics of this export alone can return no other values: "
+            "These action dimensions are the same in every step of this export: %s, counted from 0. A policy "
+            "that is normalised with only the statistics of this export cannot return other values: "
             "docs/guide/external.md#normalise-all-stages-alike shows what to do.",
             ", ".join(map(str, constant)),
         )

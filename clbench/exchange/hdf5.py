@@ -180,8 +180,7 @@ class _File:
         others = sorted(name for name in names if _NAME.fullmatch(name) is None and _is_own_group(data, name))
         if others:
             raise self._error(
-                f"data also holds {', '.join(others[:5])}: call each demonstration demo_ and its number, or "
-                "take it out"
+                f"data also holds {', '.join(others[:5])}: rename each to demo_ and its number, or remove it"
             )
         for (number, name), (following, other) in pairwise(found):
             if number == following:
@@ -216,7 +215,7 @@ class _File:
         if not abs(rate - self._rate) <= FARTHEST_RATE * self._rate:  # also if it is NaN
             raise self._error(
                 f"it was recorded at {rate:g} steps per second, but the world {self._task.world} makes "
-                f"{self._rate:g}: an action would last another time"
+                f"{self._rate:g}: each action would last a different time"
             )
 
     def _is_instruction(self, words: str) -> bool:
@@ -235,8 +234,8 @@ class _File:
         steps = len(expert)
         if not 1 <= steps <= self._task.horizon:
             raise self._error(
-                f"{where} has {counted(steps, 'step')}: it must have 1 to {self._task.horizon}, because the "
-                f"task {self._task.name} ends then"
+                f"{where} has {counted(steps, 'step')}: it must have 1 to {self._task.horizon}, the "
+                f"horizon of the task {self._task.name}"
             )
         self._check_count(group, "num_samples", where, steps, f"{counted(steps, 'row')} of actions")
         executed = self._rows(group, "executed", where, steps) if "executed" in group else expert
@@ -314,7 +313,7 @@ class _File:
         if found.file.filename != self._file.filename or found.external or found.is_virtual:
             raise self._error(f"{where}/{name} has its numbers in another file: copy them into this one")
         if found.size > MOST_NUMBERS:
-            raise self._error(f"{where}/{name} has {found.size:,} numbers; {MOST_NUMBERS:,} are the most")
+            raise self._error(f"{where}/{name} has {found.size:,} numbers; the limit is {MOST_NUMBERS:,}")
         return np.asarray(found)
 
     def _final(self, group: h5py.Group, name: str, where: str, space: Any) -> NDArray[Any]:

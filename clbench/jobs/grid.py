@@ -111,7 +111,7 @@ def run_missing(
     there = len(runs) - len(to_do.runs)
     if there:
         console.print(
-            f"{there} of {counted(len(runs), 'run')} {'has' if there == 1 else 'have'} a record already."
+            f"{there} of {counted(len(runs), 'run')} already {'has' if there == 1 else 'have'} a record."
         )
     if not any(to_do):
         return {}
@@ -139,10 +139,10 @@ def run_missing(
     _print(console, f"{done} in {seconds / 60:.1f} minutes; records in {records}.")
     bare = missing(to_do.runs, records, checkpoints).stages
     if bare:
-        kept = f"and kept no policies in {checkpoints}. Repeat the command to make them again, and keep them."
+        kept = f"but kept no policies in {checkpoints}. Repeat the command to make and keep these policies."
         _print(console, f"Another command did {counted(len(bare), 'run')} {kept}")
         theirs = {run.path(records.absolute()) for run in bare}
-        failed |= {job: f"another command did it {kept}" for job in run_jobs if _path(job) in theirs}
+        failed |= {job: f"another command did this run {kept}" for job in run_jobs if _path(job) in theirs}
     return failed
 
 
@@ -269,10 +269,10 @@ def name_of(method: str | type[Method]) -> str:
     if isinstance(method, str):
         return method
     if not isinstance(method, type):
-        raise WrongTypeError(f"A method must be a class or its name, not {method!r}.")
+        raise WrongTypeError(f"A method must be a class or the name of a method, not {method!r}.")
     place = f"{method.__module__}:{method.__qualname__}"
     if not method.__qualname__.isidentifier():
         raise WrongTypeError(
-            f"{method.__qualname__} cannot be found by its name: define it outside of functions."
+            f"{method.__qualname__} cannot be imported by its name: define the class at the top of a module."
         )
     return next((name for name, entry in installed_methods().items() if entry.value == place), place)

@@ -1,4 +1,4 @@
-"""Which runs have a record already, and need no job."""
+"""Which runs already have a record, and need no job."""
 
 from __future__ import annotations
 
@@ -88,11 +88,11 @@ def set_aside(run: ResolvedRun, records: Path) -> str | None:
         changed = changed_code(record, run)
         if record.status != "success" or not changed:
             return None
-        fault, ending = f"{' and '.join(changed)} since", "old"
+        fault, ending = f"{' and '.join(changed)} since this run", "old"
     aside = free_name(path, ending)
     with contextlib.suppress(FileNotFoundError):  # another command was faster
         path.replace(aside)
-    return f"{path}: {fault}. It is renamed to {aside.name}, and the run is repeated."
+    return f"{path}: {fault}. The record is renamed to {aside.name}, and the run is repeated."
 
 
 def changed_code(record: Record, run: ResolvedRun) -> list[str]:
@@ -132,8 +132,8 @@ def _check_definition(record: Record, published: Scenario, path: Path) -> None:
         advice = "Give the changed scenario a new version, or choose"
         here = platform.machine()
         if machine not in (None, here):
-            advice = f"Worlds may move otherwise on {machine}, where it was made, than on {here}: choose"
+            advice = f"Worlds may move differently on {machine}, where it was made, than on {here}: choose"
         raise InputError(
-            f"{path} was made with another {published.id}: {', '.join(other)} differ. {advice} "
+            f"{path} was made with another definition of {published.id}: {', '.join(other)} differ. {advice} "
             "another folder with --records."
         )

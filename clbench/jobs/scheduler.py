@@ -132,7 +132,7 @@ class _Leases:
             owners = {lease.owner for job in waiting if (lease := self._all.get(job)) is not None}
             names = ", ".join(sorted(str(owner) for owner in owners if owner is not None))
             bars.say(
-                f"Another command does the last {left}; waiting for {names or 'it'}."
+                f"Another command is doing the last {left}; waiting for {names or 'that command'}."
                 if has_worker
                 else f"No worker is free for the last {left}; waiting for one."
             )

@@ -102,7 +102,7 @@ def do_run(
     text = ", ".join(f"{name} {'-' if value is None else f'{value:.2f}'}" for name, value in values.items())
     start = record.retained_at_start()
     weak = start is not None and start < WEAK
-    return f"{text}. The pretrained policy had only {start:.2f} of the skills" if weak else text
+    return f"{text}. The pretrained policy had a success of only {start:.2f} on the skills" if weak else text
 
 
 def make_policies(spec: RunSpec, checkpoints: Path | None, progress: ProgressCallback) -> str:

@@ -112,8 +112,8 @@ def _array(values: ArrayLike, method: str) -> Array:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"The matrix{name} is no array of numbers: expected rows of equal length, NaN where a rate is "
-            f"missing ({error})."
+            f"The matrix{name} is not an array of numbers: expected rows of equal length, NaN where a rate "
+            f"is missing ({error})."
         ) from None
     if array.ndim not in (2, 3) or not array.size:
         raise InputError(
@@ -171,7 +171,7 @@ def _likely_unit(known: Mapping[Cell, float], where: str) -> Unit:
     if known[cell] <= DOUBTFUL or mixed:
         raise InputError(
             f"{where}{cell}: found {known[cell]:g}{mixed}: is it a share above 1, or per cent? Correct it, "
-            'or say --unit percent, in Python unit="percent": then all rates are per cent.'
+            'or set --unit percent (in Python, unit="percent") if all rates are per cent.'
         )
     return "percent"
 
@@ -213,7 +213,7 @@ def layout_of(
     for task in tasks:
         if chosen.count(task) != 1:
             fault = "is in no group" if task not in chosen else "is named twice"
-            raise InputError(f"Task {quoted(task)} {fault}: it is retained, a target, or held out.")
+            raise InputError(f"Task {quoted(task)} {fault}: a task is retained, a target, or held out.")
     return Layout(
         known, learned, never, episodes=(), curve_episodes=(), validation_episodes=(), steps=(1,), kinds=()
     )
@@ -225,5 +225,5 @@ def _expected_stages(layout: Layout) -> str:
     return (
         f"Expected stages 1 to {count}, one for each of {counted(count, 'target')}: stage k is the end of "
         "the training on target k, and stage 0, which may be missing, is before the first. Name tasks that "
-        "are no targets as retained or held out."
+        "are not targets as retained or held out."
     )

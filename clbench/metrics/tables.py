@@ -143,7 +143,7 @@ def _read(path: Path) -> tuple[dict[Cell, float], list[str]]:
             raise InputError(f"{where}: expected {len(header.fields)} cells, found {len(line.fields)}.")
         for cell, text in _cells(dict(zip(header.fields, line.fields, strict=True)), long, where):
             if cell in seen:
-                raise InputError(f"{where}: {cell} was given on line {seen[cell]} already.")
+                raise InputError(f"{where}: {cell} was already given on line {seen[cell]}.")
             seen[cell], cells[cell] = line.number, _rate(text, f"{where}, {cell}")
     tasks = list(dict.fromkeys(cell.task for cell in cells))
     return cells, tasks
@@ -190,7 +190,8 @@ def _cells(row: dict[str, str], long: bool, where: str) -> list[tuple[Cell, str]
     stage = stage.removesuffix(".0")  # pandas writes this if a cell of the column is missing
     if not stage.isascii() or not stage.isdigit():
         raise InputError(
-            f"{where}: stage must be a whole number, how many targets were learned, not {quoted(stage)}."
+            f"{where}: stage must be a whole number, the number of targets learned so far, not "
+            f"{quoted(stage)}."
         )
     pairs = [(row["task"], row["success"])] if long else list(row.items())
     return [(Cell(method, seed, int(stage), task), text) for task, text in pairs]

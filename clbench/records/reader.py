@@ -98,7 +98,7 @@ def check_home(run: RunInfo, path: Path, records: Path | None = None) -> Path:
     """
     home = home_of(run)
     if home.parts != (path.relative_to(records).parts if records else path.parts[-len(home.parts) :]):
-        raise RecordError(f"it is the record of {home.as_posix()}, and must be there.")
+        raise RecordError(f"it belongs at {home.as_posix()} in the folder of records.")
     return home
 
 
@@ -114,7 +114,7 @@ def _record(values: Any) -> Record:
             f"{SCHEMA}, found {found}."
         )
     if schema > SCHEMA:
-        raise UnreadableRecordError(f"is of schema {schema}, newer than {SCHEMA}: update clbench.")
+        raise UnreadableRecordError(f"has schema {schema}, which is newer than {SCHEMA}: update clbench.")
     fields = {name: value for name, value in values.items() if name not in ("schema", "content")}
     if schema < SCHEMA:
         fields = to_present(fields, schema)

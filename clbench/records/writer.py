@@ -63,13 +63,15 @@ def write_result(record: Record, path: Path) -> None:
     except RecordError:
         is_kept = is_other = False
     if is_kept and record.status == "failed":
-        LOG.warning("%s stays: it is of a run that succeeded, or may be, and the new one failed.", path)
+        LOG.warning("%s stays: its run succeeded, or may have succeeded, and the new run failed.", path)
         return
     if is_kept and is_other:
         aside = free_name(path, "old")
         with replacing(aside) as partial:  # copied, not renamed: a reader finds a record there at any time
             shutil.copyfile(path, partial)
-        LOG.warning("%s was of other settings, another budget or device: it is now %s.", path, aside.name)
+        LOG.warning(
+            "%s had other settings, another budget or another device: it is kept as %s.", path, aside.name
+        )
     write_record(record, path)
 
 
@@ -94,7 +96,7 @@ def record_text(record: Record) -> str:
         # hashed as a reader finds it: tuples are lists there, and names of entries are texts
         content = content_hash(json.loads("{" + ",".join(lines) + "}"))
     except (TypeError, ValueError, RecursionError) as error:
-        raise InputError(f"the record holds what JSON cannot hold: {error}") from error
+        raise InputError(f"the record holds a value that JSON cannot hold: {error}") from error
     return "{\n" + ",\n".join([*lines, f'"content": "{content}"']) + "\n}\n"
 
 

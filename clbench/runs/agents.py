@@ -168,8 +168,8 @@ class StagedRun:
     def __post_init__(self) -> None:
         if not self.scenario.retained:
             raise InputError(
-                f"{self.scenario.id} retains nothing: it lacks stage 0, the retained skills, with which the "
-                "evaluations of agents and of served policies begin. Choose a scenario with retained skills."
+                f"{self.scenario.id} has no retained skills. The evaluation of agents and of served policies "
+                "begins with stage 0, on retained skills: choose a scenario that has some."
             )
         check_method_name(self.method)
         if ":" in self.method:
@@ -236,13 +236,12 @@ class StagedRun:
             if not stale:
                 hint = "Evaluate all stages again (`clbench score` needs --restart), or remove the file."
                 raise RecordError(f"{error} {hint}") from error
-            LOG.warning("%s starts over: what it has so far is damaged. %s", self, error)
+            LOG.warning("%s starts over: its unfinished record is damaged. %s", self, error)
             return None
         if record.run.uses != self.uses:
             raise InputError(
-                f"{path} was begun as another kind of run: evaluate all stages of agents that learn by trial "
-                "with evaluate_agent(), and all stages of served policies with `clbench score`. Each needs a "
-                "name of its own."
+                f"{path} was begun as another kind of run: evaluate agents that learn online with "
+                "evaluate_agent(), and served policies with `clbench score`, each under its own name."
             )
         if not (finished or stale):
             self._check_version(record)
@@ -262,8 +261,8 @@ class StagedRun:
         versions = [f", {one} now" for one in changed]
         raise InputError(
             f"Stage {self.next_after(record) - 1} of {self} was evaluated with another version of the "
-            f"scenario or its simulator: {', '.join(other)} differ{''.join(versions)}. Go back to it, "
-            "evaluate all stages again (`clbench score` needs --restart), or remove the stages so far: "
+            f"scenario or its simulator: {', '.join(other)} differ{''.join(versions)}. Restore that version, "
+            "evaluate all stages again (`clbench score` needs --restart), or delete the stages so far: "
             f"{self.unfinished}."
         )
 
@@ -274,8 +273,8 @@ class StagedRun:
     def check_unfinished(self) -> None:
         """Refuse to evaluate a stage of a run that has a record, with an `InputError`."""
         if self.path.exists():
-            told = f"{self} has a record already, {self.path}, which is never edited"
-            raise InputError(f"{told}: choose another seed or name, or remove it.")
+            told = f"{self} already has a record, {self.path}, which is never edited"
+            raise InputError(f"{told}: choose another seed or name, or delete the record.")
 
     def plan(self, stage: int, again: bool) -> Record | None:
         """Return the record so far, after checking that a stage comes next or has been evaluated.
@@ -305,7 +304,7 @@ class StagedRun:
             while not lease.take():
                 if (owner := lease.owner) is not None:
                     told = f"{self} belongs to {owner}, which is evaluating its stages"
-                    raise InputError(f"{told}: choose another name or seed, or wait until it has ended.")
+                    raise InputError(f"{told}: choose another name or seed, or wait until it is done.")
                 time.sleep(1.0)  # the lease of a dead process on another machine is watched for a while
             _LEASES[self.unfinished] = lease
         _LEASES[self.unfinished].check()
@@ -340,7 +339,7 @@ class StagedRun:
         following = self.next_after(record)
         if stage < following and not again:
             raise InputError(
-                f"Stage {following} of {self} comes next, not {stage}: it was evaluated up to stage "
+                f"Stage {following} of {self} comes next, not {stage}: the last evaluated stage is "
                 f"{following - 1}."
             )
         if stage == 0:
@@ -350,7 +349,9 @@ class StagedRun:
         assert record is not None  # some stage precedes
         if settings not in (None, record.run.settings):
             before = record.run.settings
-            raise InputError(f"The settings of {self} are {settings}, but were {before} in stage 0.")
+            raise InputError(
+                f"The settings of {self} are {settings}, but were {before} in stage 0: keep them."
+            )
         if stage < following:
             LOG.warning("%s: its stages %d to %d are dropped.", self, stage, following - 1)
             record.drop_stages(stage)

@@ -237,7 +237,7 @@ def check_device(device: str) -> None:
         found = torch.device(device)
         if found.type not in ("cpu", "cuda"):
             raise InputError(
-                f"The device {device!r} cannot be used: runs repeat themselves on cpu and cuda alone."
+                f"The device {device!r} cannot be used: runs are reproducible only on cpu and cuda."
             )
         if found.type == "cuda" and (found.index or 0) < torch.cuda.device_count():
             return  # a tensor there would create a context, which keeps workers off a GPU in exclusive mode

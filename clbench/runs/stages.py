@@ -80,11 +80,11 @@ def machine_needed() -> Iterator[None]:
 
 
 def _machine_error(error: Exception, is_full: bool = False) -> MachineError:
-    fault, mend = ("has no room", "make room") if is_full else ("failed", "mend it")
+    fault, mend = ("has no room", "make room") if is_full else ("failed", "fix the problem")
     reason = str(error).partition("\n")[0]
     return MachineError(
         f"The machine {fault}: {reason}. The method is not to blame, and the run leaves no record: "
-        f"{mend}, and repeat the command."
+        f"{mend}, then repeat the command."
     )
 
 

@@ -185,10 +185,10 @@ def _settings_in(path: Path) -> dict[str, Any]:
     try:
         content: dict[str, Any] = read_json(path)
     except StrictJSONError as error:
-        raise InputError(f"{path} is no file of settings that clbench tune wrote: {error}") from error
+        raise InputError(f"{path} is not a settings file of clbench tune: {error}") from error
     whole = isinstance(content, dict) and all(isinstance(content.get(key), kinds[key]) for key in kinds)
     if not whole:
-        raise InputError(f"{path} has no settings that clbench tune wrote: write to another file.")
+        raise InputError(f"{path} is not a settings file of clbench tune: write to another file.")
     return content
 
 

@@ -79,8 +79,8 @@ def _check(metric: Metric, rows: Iterable[Runs]) -> None:
     """
     if metric.references:
         raise InputError(
-            f"{metric.name} compares a row with {' and '.join(metric.references)}, so that rows are not "
-            "compared by it. Take a metric that needs no reference, such as final_average."
+            f"{metric.name} compares a row with {' and '.join(metric.references)}, so it cannot "
+            "order rows. Choose a metric that needs no reference, such as final_average."
         )
     layouts = [run.layout for runs in rows for run in runs.values()]
     if layouts:
@@ -162,8 +162,8 @@ def _board_of(metric: str, rows: Mapping[str, Runs]) -> tuple[list[str], _Board]
             name for name, one in METRICS.items() if one.higher_is_better is not None and not one.references
         )
         raise InputError(
-            f"Rows cannot be ordered by {metric}, of which neither more nor less is better. Metrics that "
-            f"order rows: {known}."
+            f"Rows cannot be ordered by {metric}, for which neither high nor low values are better. Metrics "
+            f"that order rows: {known}."
         )
     _check(wanted, rows.values())
     sign = 1.0 if wanted.higher_is_better else -1.0

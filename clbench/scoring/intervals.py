@@ -357,7 +357,7 @@ class _Samples:
         every = (*self.methods, *self.references.values())
         if len({len(runs) for runs in every}) != 1 or not self.methods[0]:
             raise InputError(
-                "Every method needs a run of each seed, in the same order, and there must be one."
+                "All methods need runs of the same seeds, in the same order, and at least one run."
             )
         check_same(run.layout for runs in every for run in runs)
 

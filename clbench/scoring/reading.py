@@ -133,7 +133,7 @@ def read_relearning(record: Record, protocol: Protocol) -> Array:
     if protocol.criterion is None:
         raise RecordError("relearning: its budget has no criterion that could have been met.")
     if found.skill not in protocol.retained:
-        raise RecordError(f"relearning: {found.skill!r} is no retained skill.")
+        raise RecordError(f"relearning: {found.skill!r} is not a retained skill.")
     if not 0 <= found.successes <= protocol.validation_episodes:
         raise RecordError("relearning: it has an impossible number of successes.")
     planned = check_steps(protocol.steps[-1])
@@ -153,14 +153,14 @@ def _check_steps(steps: Any) -> None:
     ):
         raise RecordError("scenario: evaluation_steps must be a list of rising whole numbers above 0.")
     if len(steps) > MOST_POINTS:
-        raise RecordError(f"scenario: {len(steps):,} evaluation_steps; {MOST_POINTS} are the most.")
+        raise RecordError(f"scenario: {len(steps):,} evaluation_steps; the limit is {MOST_POINTS}.")
 
 
 def check_cells(what: str, *sizes: int) -> None:
     """Refuse a table that is too large to be resampled."""
     if math.prod(sizes) > MOST_CELLS:
         text = " x ".join(f"{size:,}" for size in sizes)
-        raise RecordError(f"it is too large to be shown: {what} are {text}, and {MOST_CELLS:,} are the most.")
+        raise RecordError(f"it is too large to be shown: {what} are {text}, and the limit is {MOST_CELLS:,}.")
 
 
 def place(protocol: Protocol, point: Point) -> int:
@@ -182,7 +182,7 @@ class _Points:
             raise RecordError(f"{where} has an impossible stage or step.")
         point = Point(stage, step)
         if point not in self.points:
-            raise RecordError(f"{where} is of stage {stage}, step {step}, which is no evaluation point.")
+            raise RecordError(f"{where} is of stage {stage}, step {step}, which is not an evaluation point.")
         return point
 
 
@@ -221,7 +221,7 @@ def _check_kinds(protocol: Protocol, rows: Iterable[EpisodeRow]) -> None:
     if protocol.split not in splits:
         raise RecordError(f"episodes: there is no {protocol.split} episode.")
     if protocol.split == "validation" and len(splits) > 1:
-        raise RecordError("episodes: a tuning run has validation episodes alone.")
+        raise RecordError("episodes: a tuning run has only validation episodes.")
     if "perturbed" in splits and not protocol.perturb:
         raise RecordError("episodes: there are perturbed ones, but its run does not say perturb.")
 

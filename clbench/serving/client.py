@@ -151,9 +151,9 @@ class ServedPolicy:
             if self._greeting is not None and greeting != self._greeting:
                 changed = sorted(str(name) for name, _ in greeting.items() ^ self._greeting.items())
                 raise InputError(
-                    f"The server at {self.address} came back as another one: its metadata differ in "
-                    f"{printable(', '.join(dict.fromkeys(changed)))}. A stage needs one checkpoint: serve "
-                    "it, and score the stage again."
+                    f"The server at {self.address} is not the one that the stage began with: its metadata "
+                    f"differ in {printable(', '.join(dict.fromkeys(changed)))}. A stage needs one "
+                    "checkpoint: serve that checkpoint, and score the stage again."
                 )
             self._greeting = greeting
             self.metadata, self._opened = metadata, opened.pop_all()
@@ -187,8 +187,8 @@ class ServedPolicy:
 
     def _late(self) -> InputError:
         return InputError(
-            f"The policy at {self.address} did not answer within {self._timeout:g} seconds: a slower one "
-            "needs a larger --timeout, and so does one that answers other clients first."
+            f"The policy at {self.address} did not answer within {self._timeout:g} seconds. Set a larger "
+            "--timeout if the policy is slow or answers other clients first."
         )
 
     def _receive(self, connection: ClientConnection) -> Any:

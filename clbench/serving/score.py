@@ -68,9 +68,9 @@ def is_scored(
     for name, value in settings.items():
         if value is not None and kept.get(name) != value:
             hint = (
-                "Its record is finished, and never edited"
+                "The record is finished and is never edited"
                 if run.path.exists()
-                else "Score it again with --restart, which drops it and later stages, or leave the option out"
+                else "Score it again with --restart, which also drops all later stages, or omit the option"
             )
             raise InputError(
                 f"Stage {stage} of {run} was scored with {name} {kept.get(name)!r}, not {value!r}. {hint}."
@@ -132,7 +132,7 @@ def score(
     executed, steps = whole_number("executed", executed, 1), whole_number("steps", steps, 0)
     stage = int(stage) if is_whole(stage) else stage  # of NumPy, which JSON cannot hold
     if data is not None and not isinstance(data, str):
-        raise WrongTypeError(f"data must be words, not {data!r}.")
+        raise WrongTypeError(f"data must be a string, not {data!r}.")
     run = StagedRun(load_scenario(scenario), method, seed, Path(records), EXTERNAL_USES)
     begin = time.perf_counter()
     views = Views(pictures, picture_size)
@@ -206,7 +206,8 @@ def _warn_if_unchanged(record: Record, stage: int) -> None:
     succeeded = any(now[place][0] for place in shared)  # all failures have the same length
     if succeeded and all(before[place] == now[place] for place in shared):
         LOG.warning(
-            "All %d episodes ended as in stage %d, in equal steps: does the policy have the new checkpoint?",
+            "All %d episodes ended as in stage %d, after as many steps: does the policy have the new "
+            "checkpoint?",
             len(shared),
             stage - 1,
         )
@@ -248,9 +249,9 @@ def _warn(stage: int, played: ChunkPlay) -> None:
         for share, what in (
             (
                 played.not_finite,
-                "with NaN or an infinite number, which is replaced by 0 or the nearest bound",
+                "with NaN or infinite numbers, which were replaced by 0 or the nearest bound",
             ),
-            (played.clipped, "outside of the action space, which is clipped"),
+            (played.clipped, "outside of the action space, which was clipped to its bounds"),
         )
         if share
     ]

@@ -283,7 +283,8 @@ def _answer(policy: Policy, message: str | bytes) -> bytes:
     if np.ndim(observations.get("state", 0)) != 2:
         names = ", ".join(map(str, observations))
         raise ValueError(
-            f"A request must hold a batch: `state` (B, S) and others, see server.py, not {names}."
+            "A request must hold a batch: `state` (B, S) and the other observations that server.py lists, "
+            f"not {names}."
         )
     actions = policy(observations)
     if not hasattr(actions, "__array__") and not isinstance(actions, (list, tuple)):
@@ -345,7 +346,7 @@ def unpack(message: bytes) -> Any:
     try:
         return msgpack.unpackb(message, object_hook=_decode)
     except (ValueError, TypeError, KeyError, OverflowError, msgpack.exceptions.UnpackException) as error:
-        raise ValueError(f"This is no message of a policy: {str(error) or type(error).__name__}") from error
+        raise ValueError(f"This is not a valid message: {str(error) or type(error).__name__}") from error
 
 
 def _encode(value: Any) -> Any:

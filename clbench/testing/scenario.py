@@ -164,7 +164,9 @@ def _check_task(task: Task, world: World, episodes: int, success: float) -> None
         afresh = _play(task, new, seeds[0], expert)
     for other, where in ((again, "after other episodes"), (afresh, "in a new world")):
         if not np.array_equal(other.states, played[0].states):
-            raise ScenarioError(f"task {task.name}: the same seed and actions give another episode {where}.")
+            raise ScenarioError(
+                f"task {task.name}: the same seed and actions give a different episode {where}."
+            )
     _check_side_by_side(task, seeds[:2], played[:2])
 
 
@@ -204,7 +206,7 @@ def _play(task: Task, world: World, seed: int, act: Any) -> _Episode:
             raise ScenarioError(f"{where}: the world truncates, but only the task's horizon may do so.")
         if np.shares_memory(state, states[-1]):
             raise ScenarioError(
-                f"{where}: the world gives the array of its last state again, changed: return a copy."
+                f"{where}: the world changed its last state in place and returned it: return a copy."
             )
         states.append(state)
         if not np.isfinite(float(reward)):
@@ -224,7 +226,10 @@ def _check_side_by_side(task: Task, seeds: list[int], alone: list[_Episode]) -> 
             for lane, state in zip(going, states, strict=True):
                 found[lane].append(state)
     if any(not np.array_equal(np.array(found[lane]), alone[lane].states) for lane in lanes):
-        raise ScenarioError(f"task {task.name}: side by side its episodes differ from {task.world} alone.")
+        raise ScenarioError(
+            f"task {task.name}: its episodes in parallel lanes differ from its episodes in a single "
+            f"{task.world}."
+        )
 
 
 # ---- questions ---------------------------------------------------------------------------------------------

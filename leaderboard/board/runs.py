@@ -219,15 +219,15 @@ def division_of(uses: dict[str, Any]) -> str:
     kinds = ("demonstrations", "questions")
     if "external" in uses:
         if uses != EXTERNAL_USES:
-            raise RecordError("run: uses of a policy that was fine-tuned elsewhere must say nothing else.")
+            raise RecordError("run: uses of a policy that was fine-tuned elsewhere must hold nothing else.")
         return "external"
     if "online" in uses:
         if uses != ONLINE_USES:
-            raise RecordError("run: uses of an agent that learned online must be of nothing else.")
+            raise RecordError("run: uses of an agent that learned online must hold nothing else.")
         return "online"
     if set(uses) != {*kinds, "reference"} or any(uses[kind] not in ACCESS for kind in kinds):
         raise RecordError(
-            f"run: uses must say when demonstrations and questions are touched, {' or '.join(ACCESS)}, and "
+            f"run: uses must say when demonstrations and questions are used, {' or '.join(ACCESS)}, and "
             "whether the method is a reference."
         )
     if type(uses["reference"]) is not bool:
@@ -310,8 +310,8 @@ def unlike_the_pin(run: Run, moves: bool = False) -> str:
     other = [name for name in parts if not (moves and name.startswith(("task ", "questions")))]
     if not other:
         return ""
-    where = f" Worlds may move otherwise on {machine_of(run.record.fingerprint)}." if _is_of_arm(run) else ""
-    return f"it was made with another {scenario}: {', '.join(other)} differ.{where}"
+    where = f" Worlds move differently on {machine_of(run.record.fingerprint)}." if _is_of_arm(run) else ""
+    return f"it was made with another definition of {scenario}: {', '.join(other)} differ.{where}"
 
 
 def _is_of_arm(run: Run) -> bool:
@@ -330,7 +330,7 @@ def _same_parts(runs: list[Run], later: bool) -> Sifted:
 
     def reason(run: Run, other: Run) -> str:
         names = ", ".join(differences(parts(run), parts(other)))
-        return f"its scenario is not that of most records: {names} differ."
+        return f"its definition of the scenario does not match most records: {names} differ."
 
     told = [run for run in runs if parts(run) is not None]
     kept, refused = _most(told, lambda run: run.table, lambda run: _text(parts(run)), reason)

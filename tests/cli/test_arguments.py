@@ -81,7 +81,7 @@ def test_a_path_may_begin_with_the_home_folder(
             "replay must be from 0 to 1, not 7.0",
         ),
         (["run", "clbench/Fetch-v1", "sft", "--device", "gpu"], "The device 'gpu' cannot be used"),
-        (["run", "clbench/Fetch-v1", "sft", "--device", "mps"], "repeat themselves on cpu and cuda alone.\n"),
+        (["run", "clbench/Fetch-v1", "sft", "--device", "mps"], "reproducible only on cpu and cuda.\n"),
         (["tune", "clbench/Fetch-v1", "sft", "--device", "gpu"], "The device 'gpu' cannot be used"),
         (["submit", "sft", "--device", "gpu"], "The device 'gpu' cannot be used"),
         (["run", "clbench/Fetch-v1,clbench/PointMase-v1", "sft"], "Did you mean 'clbench/PointMaze-v1'?"),
@@ -119,7 +119,7 @@ def test_a_path_may_begin_with_the_home_folder(
         (["tune", "clbench/Fetch-v1", "sft", "--values.x", "1", "--set.y", "1"], "--set cannot be used"),
         (
             ["tune", "clbench/Fetch-v1", "sft", "shuffled_weights"],
-            "has its settings: tune consft_calibrated.",
+            "uses its settings: tune consft_calibrated instead.",
         ),
         (
             ["tune", "clbench/Fetch-v1", "consft", "--values.kapa", "1,2"],
@@ -139,7 +139,7 @@ def test_a_path_may_begin_with_the_home_folder(
             ["run", "clbench/Fetch-v1", "sft", "--records", "/proc/x", "--dry-run"],
             "/proc/x cannot be written",
         ),
-        (["status", "--seeds", "99"], "--seeds chooses among the runs of a scenario: name the scenario"),
+        (["status", "--seeds", "99"], "--seeds needs a scenario: name the scenario"),
         (["list", "foo"], "list does not take 'foo': see clbench list --help."),
         (["claims", "--records", "nowhere"], "There is no folder of records at nowhere."),
         (["findings", "--records", "nowhere"], "There is no folder of records at nowhere."),

@@ -245,7 +245,7 @@ def test_the_next_steps_name_another_folder(
         ("sft", "'sft' is a built-in method. Did you mean 'my_sft'?"),
         ("s_f_t", "would take for 'sft'"),
         ("nul", "the name of a device on Windows"),
-        ("torch", "There is a module 'torch' already. Did you mean 'torch_method'?"),
+        ("torch", "A module named 'torch' already exists. Did you mean 'torch_method'?"),
     ],
 )
 def test_an_impossible_name_is_refused_with_the_reason_and_nothing_is_written(
@@ -300,7 +300,10 @@ def test_a_record_counts_only_for_the_code_that_its_policy_has_now(fresh_policy:
     assert not has_record(spec.resolve(), records)
     said = set_aside(spec.resolve(), records)
     assert said is not None
-    assert f"the code of {fresh_policy} has changed since. It is renamed to seed-0.json.old" in said
+    assert (
+        f"the code of {fresh_policy} has changed since this run. The record is renamed to seed-0.json.old"
+        in said
+    )
 
 
 @pytest.mark.long
@@ -316,7 +319,10 @@ def test_a_record_counts_only_for_the_weights_that_its_policy_brings_now(tmp_pat
     own_weights(tmp_path, "0.25")
     said = set_aside(spec.resolve(), records)
     assert said is not None
-    assert "the weights of own_policy:Own have changed since. It is renamed to seed-0.json.old" in said
+    assert (
+        "the weights of own_policy:Own have changed since this run. The record is renamed to seed-0.json.old"
+        in said
+    )
 
 
 @pytest.mark.long

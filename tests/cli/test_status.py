@@ -115,7 +115,7 @@ def test_an_option_that_chooses_among_the_runs_of_a_scenario_needs_one(
     with pytest.raises(SystemExit) as stopped:
         app(["status", "--records", str(records), *option])
     assert stopped.value.code == 2
-    expected = f"{option[0]} chooses among the runs of a scenario: name the scenario first."
+    expected = f"{option[0]} needs a scenario: name the scenario first."
     assert expected in " ".join(capsys.readouterr().err.split())
 
 
@@ -177,7 +177,7 @@ def test_a_copy_of_a_record_under_another_name_is_not_another_run(tmp_path: Path
     state = run_state(copy)
     assert state.state == "damaged"
     assert state.reason is not None
-    assert "it is the record of Toy-v0/frozen/seed-0.json, and must be there" in state.reason
+    assert "it belongs at Toy-v0/frozen/seed-0.json in the folder of records" in state.reason
 
 
 def test_the_time_left_counts_what_runs_and_what_nobody_has_begun() -> None:

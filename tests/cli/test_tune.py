@@ -67,7 +67,7 @@ def test_tune_compares_settings_without_test_episodes(tune: Tune, tmp_path: Path
     )  # at strength 0 it is plain fine-tuning
     assert plain.policy != some.policy
     assert all("test" not in record.episodes["split"] for record in records.values())
-    assert "3 of 3 runs have a record already" in tune("--values.strength", "0,1")[1]
+    assert "3 of 3 runs already have a record" in tune("--values.strength", "0,1")[1]
 
 
 @pytest.mark.long

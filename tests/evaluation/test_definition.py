@@ -208,8 +208,10 @@ def test_a_record_of_another_definition_is_refused_by_run_and_not_shown_on_the_b
     assert has_record(run, tmp_path)
     other = {**definition(TOY), "questions": "another"}
     monkeypatch.setattr("clbench.evaluation.definition.definition", lambda _: other)
-    with pytest.raises(InputError, match=r"made with another clbench/Toy-v0: questions differ\. Give"):
+    with pytest.raises(
+        InputError, match=r"made with another definition of clbench/Toy-v0: questions differ\. Give"
+    ):
         has_record(run, tmp_path)
     monkeypatch.setattr("platform.machine", lambda: "arm64")
-    with pytest.raises(InputError, match=r"Worlds may move otherwise on x86_64, .* than on arm64: choose"):
+    with pytest.raises(InputError, match=r"Worlds may move differently on x86_64, .* than on arm64: choose"):
         has_record(run, tmp_path)

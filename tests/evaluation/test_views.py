@@ -125,7 +125,7 @@ def test_a_policy_that_acts_on_a_real_scene_gets_its_pictures() -> None:
 
 
 def test_scenes_without_a_common_camera_are_refused() -> None:
-    with pytest.raises(InputError, match="no camera 'fixed': the scenes of the tasks have none in common"):
+    with pytest.raises(InputError, match="no camera 'fixed': the scenes of the tasks share no camera"):
         Views(["fixed"]).check(load_scenario("clbench/DMControl-v0").retained)
 
 

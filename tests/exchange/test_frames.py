@@ -77,7 +77,7 @@ def test_a_record_at_the_place_of_another_run_adds_nothing_and_hides_nothing(
     (records / place).write_text(json.dumps(sealed(values)), encoding="utf-8")
     with caplog.at_level(logging.WARNING):
         assert clbench.load_records(records).equals(before)
-    assert f"{place}: it is the record of Toy-v0/sft/seed-0.json, and must be there." in caplog.text
+    assert f"{place}: it belongs at Toy-v0/sft/seed-0.json in the folder of records." in caplog.text
 
 
 def test_a_folder_of_one_method_is_read_from_inside_and_through_a_link(

@@ -52,4 +52,4 @@ def test_its_exports_are_commands(
     for command in _commands()[:2]:
         with pytest.raises(SystemExit):  # a folder that exists is refused after all other checks
             app([*command[:-1], str(tmp_path)])
-        assert f"{tmp_path} exists: an export makes a new folder" in capsys.readouterr().err
+        assert f"{tmp_path} already exists: name a new folder for the export" in capsys.readouterr().err

@@ -237,7 +237,7 @@ def _last(value: float) -> Callable[[h5py.Group], None]:
         (_last(1.5), r"row 1, column 0 of data/demo_1/actions is 1.5: the world .* from -1 to 1"),
         (
             _set("demo_1/actions", np.zeros((0, 2))),
-            "data/demo_1 has 0 steps: it must have 1 to 12, because the task right ends then",
+            "data/demo_1 has 0 steps: it must have 1 to 12, the horizon of the task right",
         ),
         (_longer, "data/demo_0 has 13 steps: it must have 1 to 12"),
         (_attribute("num_samples", 3, "demo_1"), "demo_1 has num_samples 3, but 4 rows of actions"),
@@ -250,11 +250,11 @@ def _last(value: float) -> Callable[[h5py.Group], None]:
         (lambda data: data.copy("demo_0", "demo_00"), "data has both demo_0 and demo_00"),
         (
             lambda data: data.move("demo_1", "demo_1_retry"),
-            "data also holds demo_1_retry: call each",
+            "data also holds demo_1_retry: rename each",
         ),
         (
             lambda data: data.move("demo_1", "Demo_1"),
-            "data also holds Demo_1: call each",
+            "data also holds Demo_1: rename each",
         ),
         (_set("demo_0", h5py.SoftLink("/nowhere")), "data/demo_0 must be a group, not .* a broken link"),
         (_set("demo_0", h5py.ExternalLink("none.hdf5", "/data/demo_0")), "data/demo_0 must be a group"),
@@ -264,9 +264,9 @@ def _last(value: float) -> Callable[[h5py.Group], None]:
         ),
         (
             _claimed("demo_1/actions", (10**9, 2)),
-            "actions has 2,000,000,000 numbers; 10,000,000 are",
+            "actions has 2,000,000,000 numbers; the limit is 10,000,000",
         ),
-        (_claimed("demo_1/states", (4, 10**8)), "states has 400,000,000 numbers; 10,000,000 are the most"),
+        (_claimed("demo_1/states", (4, 10**8)), "states has 400,000,000 numbers; the limit is 10,000,000"),
         (
             _attribute("problem_info", '{"language_instruction": [1, 2]}'),
             r"language_instruction in problem_info must be a string, not '\[1, 2\]'",
@@ -277,7 +277,8 @@ def _last(value: float) -> Callable[[h5py.Group], None]:
         ),
         (
             _attribute("env_args", '{"env_kwargs": {"control_freq": 20}}'),
-            "recorded at 20 steps per second, but the world .* makes 10: an action would last another time",
+            "recorded at 20 steps per second, but the world .* makes 10: each action would last a different "
+            "time",
         ),
         (_attribute("env_args", '{"env_kwargs": {"control_freq": NaN}}'), "recorded at nan steps per second"),
     ],

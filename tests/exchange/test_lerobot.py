@@ -250,7 +250,7 @@ def test_a_world_without_the_rate_of_the_others_is_an_error_that_leaves_nothing(
 def test_what_cannot_be_exported_is_refused_before_any_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(InputError, match="exists: an export makes a new folder"):
+    with pytest.raises(InputError, match="already exists: name a new folder for the export"):
         export_demonstrations(TOY, tmp_path, format="lerobot")
     with pytest.raises(LookupError, match=r"No format is called 'hdf'. Did you mean 'hdf5'\?"):
         export_demonstrations(TOY, tmp_path / "out", format="hdf")  # type: ignore[arg-type]

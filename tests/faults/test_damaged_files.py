@@ -259,7 +259,9 @@ def _counts(run: ResolvedRun, records: Path) -> bool | None:
     try:
         return has_record(run, records)
     except InputError as error:
-        if not str(error).startswith(f"{run.path(records)} was made with another clbench/Toy-v0"):
+        if not str(error).startswith(
+            f"{run.path(records)} was made with another definition of clbench/Toy-v0"
+        ):
             raise
         return None
 

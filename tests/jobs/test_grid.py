@@ -60,10 +60,13 @@ def test_a_class_of_the_script_itself_runs_and_its_change_is_noticed(tmp_path: P
     result = run_script(SCRIPT, tmp_path)
     assert result.stdout == "__main__:Slow success 0 0.5\n"  # once: no process did the script again
     again = run_script(SCRIPT, tmp_path)
-    assert "1 of 1 run has a record already." in again.stderr
+    assert "1 of 1 run already has a record." in again.stderr
     changed = run_script(SCRIPT.replace("0.5", "0.25", 1), tmp_path)
     assert changed.stdout == "__main__:Slow success 0 0.25\n"
-    assert "the code of __main__:Slow has changed since. It is renamed to seed-0.json.old" in changed.stderr
+    assert (
+        "the code of __main__:Slow has changed since this run. The record is renamed to seed-0.json.old"
+        in changed.stderr
+    )
     kept = sorted(path.name for path in (tmp_path / "records").rglob("*.json*"))
     assert kept == ["seed-0.json", "seed-0.json.old"]
 
@@ -150,7 +153,7 @@ def test_a_class_inside_a_function_is_refused(tmp_path: Path) -> None:
     class Hidden(clbench.Method):
         pass
 
-    with pytest.raises(TypeError, match="cannot be found by its name: define it outside of functions"):
+    with pytest.raises(TypeError, match="cannot be imported by its name: define the class at the top"):
         clbench.run(TOY, Hidden, records=tmp_path)
 
 
@@ -169,10 +172,10 @@ def test_a_run_of_another_command_that_kept_no_policies_is_told(
     printed = io.StringIO()
     console = Console(file=printed, width=200)
     failed = run_missing([spec.resolve()], records, Here, console, tmp_path / "kept")
-    assert f"Another command did 1 run and kept no policies in {tmp_path / 'kept'}." in printed.getvalue()
+    assert f"Another command did 1 run but kept no policies in {tmp_path / 'kept'}." in printed.getvalue()
     ((job, reason),) = failed.items()
     assert str(job) == "me--Tiny-v0 frozen seed 0"
-    assert reason.startswith("another command did it and kept no policies in ")
+    assert reason.startswith("another command did this run but kept no policies in ")
     monkeypatch.undo()
     printed = io.StringIO()
     run_missing([spec.resolve()], records, Here, Console(file=printed, width=200), tmp_path / "kept")
@@ -219,9 +222,9 @@ def test_making_policies_of_a_submitted_method_again_has_the_limits_of_its_check
         ({"first_seed": -1}, "seed must be at least 0, not -1"),
         ({"scenario": "clbench/Fetsh-v1"}, "Did you mean 'clbench/Fetch-v1'"),
         ({"method": "stf"}, "Did you mean 'sft'"),
-        ({"method": 3}, "A method must be a class or its name, not 3"),
+        ({"method": 3}, "A method must be a class or the name of a method, not 3"),
         ({"scenario": None}, "scenario of a run must be a string, its id, not None"),
-        ({"device": "mps"}, "The device 'mps' cannot be used: runs repeat themselves on cpu and cuda"),
+        ({"device": "mps"}, "The device 'mps' cannot be used: runs are reproducible only on cpu and cuda"),
     ],
 )
 def test_wrong_values_are_named_before_anything_runs(

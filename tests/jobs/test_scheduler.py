@@ -169,7 +169,7 @@ def test_a_job_that_another_command_does_waits_for_it(
     assert made.read_text() == text
     text = printed(bars)
     assert text.index("other: went well") < text.index("claimed: ")
-    assert f"Another command does the last job; waiting for process {other.pid} on " in text
+    assert f"Another command is doing the last job; waiting for process {other.pid} on " in text
     assert ("claimed: done by another command" in text) == (end == "finish")
     assert {path.name for path in tmp_path.iterdir()} <= {"made", "other", "some_jobs.py", "__pycache__"}
 

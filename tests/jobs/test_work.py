@@ -44,7 +44,7 @@ def test_a_policy_that_can_do_little_is_called_weak_before_and_after_a_run(
     said = evaluate_policy(SPEC, nothing)
     assert said.startswith("success 0.33 on the retained skills. That is low: ")
     said = do_run(SPEC, tmp_path / "weak", nothing)
-    assert said.endswith(". The pretrained policy had only 0.33 of the skills")
+    assert said.endswith(". The pretrained policy had a success of only 0.33 on the skills")
     for rate, weak in ((0.79, True), (0.8, False)):
         monkeypatch.setattr(Record, "retained_at_start", lambda _, rate=rate: rate)
         assert ("That is low" in evaluate_policy(SPEC, nothing)) == weak

@@ -25,7 +25,7 @@ def test_methods_are_compared_over_the_seeds_that_were_asked_for(
     clbench.run(TOY, "joint", seeds=1, records=tmp_path)
     capsys.readouterr()
     table = clbench.compare(TOY, ["frozen"], seeds=1, records=tmp_path).set_index("method")
-    assert "1 of 2 runs has a record already." in capsys.readouterr().err
+    assert "1 of 2 runs already has a record." in capsys.readouterr().err
     assert sorted(table.index) == ["frozen", "sft"]  # sft by itself; joint was not asked for
     assert list(table["seeds"]) == [1, 1]
     assert table.loc["frozen", "retention"] > table.loc["sft", "retention"]

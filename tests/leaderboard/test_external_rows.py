@@ -93,5 +93,5 @@ def test_a_record_that_also_claims_another_division_is_refused(
     path.write_text(json.dumps(sealed(values)), encoding="utf-8")
     table = compute_board(tmp_path)
     assert not table.rows
-    reason = "run: uses of a policy that was fine-tuned elsewhere must say nothing else."
+    reason = "run: uses of a policy that was fine-tuned elsewhere must hold nothing else."
     assert table.not_shown[0].reason == reason

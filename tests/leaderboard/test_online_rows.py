@@ -108,4 +108,4 @@ def test_a_record_that_claims_online_learning_and_prior_data_is_refused(
     path.write_text(json.dumps(sealed(values)), encoding="utf-8")
     table = compute_board(tmp_path)
     assert not table.rows
-    assert table.not_shown[0].reason == "run: uses of an agent that learned online must be of nothing else."
+    assert table.not_shown[0].reason == "run: uses of an agent that learned online must hold nothing else."

@@ -121,7 +121,7 @@ def test_per_cent_are_recognised_and_can_be_declared() -> None:
 def test_rates_that_leave_their_unit_in_doubt_are_refused_unless_it_is_named(
     matrix: ArrayLike, where: str
 ) -> None:
-    with pytest.raises(InputError, match=f'{where}.*say --unit percent, in Python unit="percent"'):
+    with pytest.raises(InputError, match=rf'{where}.*set --unit percent \(in Python, unit="percent"\)'):
         from_matrix(matrix)
     assert from_matrix(matrix, unit="percent").unit == "percent"
 
@@ -341,8 +341,8 @@ def test_a_table_of_pandas_has_a_row_for_every_metric_and_method() -> None:
         ({"matrix": [[0.5]], "tasks": ["a", "b"]}, "There are 2 names for 1 task"),
         ({"matrix": {"a": [[0.5]], "b": TRIANGLE}}, r"'a' \(1, 1\), 'b' \(3, 3\)"),
         ({"matrix": {}}, "expected at least one method"),
-        ({"matrix": [[0.5, 0.5], [0.5]]}, "The matrix is no array of numbers: expected rows of equal length"),
-        ({"matrix": {"a": [["high"]]}}, "The matrix of method 'a' is no array of numbers"),
+        ({"matrix": [[0.5, 0.5], [0.5]]}, "The matrix is not an array of numbers: expected rows of equal"),
+        ({"matrix": {"a": [["high"]]}}, "The matrix of method 'a' is not an array of numbers"),
         (
             {"matrix": [[0.5]], "unit": "percentage"},
             r"must be 'share' or 'percent', not 'percentage'\. Did you mean 'percent'",

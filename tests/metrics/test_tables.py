@@ -134,11 +134,11 @@ def test_every_example_names_its_source_and_can_be_read_by_its_name() -> None:
     [
         ("stage,reach\n1,0,5\n", "line 2: expected 2 cells, found 3"),
         ("stage,reach\n1,half\n", "line 2, stage 1, task 'reach': expected a success rate such as 0.8 or 80"),
-        ("stage,reach\n1,0.5\n1,0.6\n", "line 3: stage 1, task 'reach' was given on line 2 already"),
-        ("stage,reach\n1,0.5\n1,0.5\n", "line 3: stage 1, task 'reach' was given on line 2 already"),
+        ("stage,reach\n1,0.5\n1,0.6\n", "line 3: stage 1, task 'reach' was already given on line 2"),
+        ("stage,reach\n1,0.5\n1,0.5\n", "line 3: stage 1, task 'reach' was already given on line 2"),
         (
             "stage,reach\nfirst,0.5\n",
-            "line 2: stage must be a whole number, how many targets were learned, not 'first'",
+            "line 2: stage must be a whole number, the number of targets learned so far, not 'first'",
         ),
         ("stage,reach,push\n1,0.5,0.5\n", "The stages are 1 to 1. Expected stages 1 to 2"),
         ("stage,reach\n1,500\n", "stage 1, task 'reach': expected per cent from 0 to 100, found 500"),

@@ -61,7 +61,7 @@ def test_a_path_that_is_no_file_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"schema": 6}, "is of schema 6, newer than 5: update clbench"),
+        ({"schema": 6}, "has schema 6, which is newer than 5: update clbench"),
         ({"schema": 0}, r"whole number from 1 to 5, found '0'\."),
         ({"schema": True}, r"found 'True'\."),
         ({"score": 0.99}, "score"),

@@ -28,7 +28,7 @@ def test_stages_are_evaluated_once_and_in_order(evaluate: Callable[..., Any]) ->
         evaluate(Knowing(), stage_env(1))
     evaluate(Knowing(), stage_env(0))
     evaluate(Knowing(), stage_env(1))
-    with pytest.raises(ValueError, match=r"Stage 2 of .* comes next, not 1: it was evaluated up to stage 1"):
+    with pytest.raises(ValueError, match=r"Stage 2 of .* comes next, not 1: the last evaluated stage is 1"):
         evaluate(Knowing(), stage_env(1))
     with pytest.raises(ValueError, match=r"settings of .* are \{'speed': 4\}, but were \{\} in stage 0"):
         evaluate(Knowing(), stage_env(2), settings={"speed": 4})
@@ -39,7 +39,7 @@ def test_a_finished_record_is_never_edited(evaluate: Callable[..., Any]) -> None
     for stage in range(3):
         evaluate(Knowing(), stage_env(stage))
     for stage in (0, 2):
-        with pytest.raises(ValueError, match=r"has a record already, .*seed-0\.json, which is never edited"):
+        with pytest.raises(ValueError, match=r"already has a record, .*seed-0\.json, which is never edited"):
             evaluate(Knowing(), stage_env(stage))
     evaluate(Knowing(), stage_env(0), seed=1)
 
@@ -126,7 +126,7 @@ def test_a_run_with_a_damaged_file_can_only_start_over(
     with pytest.raises(RecordError, match=again):
         evaluate(Knowing(), stage_env(1))
     evaluate(Knowing(), stage_env(0))
-    assert "starts over: what it has so far is damaged" in caplog.text
+    assert "starts over: its unfinished record is damaged" in caplog.text
     assert next_stage(ID, method="me/knows", records=tmp_path / "records") == 1
 
 
@@ -201,7 +201,7 @@ def test_two_programs_do_not_mix_their_stages(evaluate: Callable[..., Any], empt
         assert other.stdout is not None
         for stage in range(3):
             assert other.stdout.readline() == f"{stage}\n"
-            message = f"belongs to process {other.pid} on " if stage < 2 else "has a record already"
+            message = f"belongs to process {other.pid} on " if stage < 2 else "already has a record"
             for mine in range(3):  # while the other one trains for its next stage
                 with pytest.raises(InputError, match=message):
                     evaluate(Knowing(), stage_env(mine))

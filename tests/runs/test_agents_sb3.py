@@ -98,7 +98,7 @@ def test_an_agent_that_learned_behind_a_wrapper_is_refused(
     env: Callable[[], Any], policy: str, other: str, evaluate: Callable[..., Any]
 ) -> None:
     agent = ppo(env(), policy)
-    with pytest.raises(ValueError, match=f"learned with other {other} than those of clbench/Toy-v0"):
+    with pytest.raises(ValueError, match=f"trained with {other} that differ from those of clbench/Toy-v0"):
         evaluate(agent, WORDS())
 
 

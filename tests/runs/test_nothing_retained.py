@@ -69,9 +69,9 @@ def test_the_schedule_of_many_environments_begins_with_the_first_target() -> Non
 
 def test_online_agents_are_refused_because_there_is_no_stage_0(tmp_path: Path) -> None:
     env = gymnasium.make(SCENARIO.id, stage=1)
-    with pytest.raises(ValueError, match="clbench/ToyUnretained-v0 retains nothing"):
+    with pytest.raises(ValueError, match="clbench/ToyUnretained-v0 has no retained skills"):
         evaluate_agent(lambda _: np.zeros(2), env, method="me/still", records=tmp_path)
-    with pytest.raises(ValueError, match="retains nothing"):
+    with pytest.raises(ValueError, match="has no retained skills"):
         next_stage(SCENARIO.id, method="me/still", records=tmp_path)
 
 

@@ -306,7 +306,7 @@ def test_a_run_that_fails_leaves_a_good_record_of_another_configuration_alone(
     record = execute(dataclasses.replace(spec, perturb=True), tmp_path)
     assert record.status == "failed"
     assert spec.path(tmp_path).read_bytes() == before
-    assert "stays: it is of a run that succeeded" in caplog.text
+    assert "stays: its run succeeded" in caplog.text
 
 
 @pytest.mark.long
@@ -363,7 +363,7 @@ def test_a_record_of_other_settings_is_kept_next_to_the_new_one(
     write_result(on_a_gpu, path)
     assert read_record(path).run.device == "cuda"
     assert old.read_bytes() == before
-    assert "it is now seed-0.json.old" in caplog.text
+    assert "it is kept as seed-0.json.old" in caplog.text
     write_result(record, path)
     assert read_record(path.with_name("seed-0.json.old")).run.perturb
     assert path.with_name("seed-0.json.old1").exists()

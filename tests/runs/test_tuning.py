@@ -196,10 +196,10 @@ def test_a_control_has_the_settings_of_its_method_and_differs_in_nothing_else(
             '{"scenario": "me/Other-v0", "seeds": [100], "methods": {}}',
             "of me/Other-v0, not of clbench/Toy-v0",
         ),
-        ("{}", "no settings that clbench tune wrote"),
-        ("[]", "no settings that clbench tune wrote"),
+        ("{}", "not a settings file of clbench tune"),
+        ("[]", "not a settings file of clbench tune"),
         ("task,success", "cannot be read as JSON"),
-        (None, "no file of settings"),
+        (None, "not a settings file"),
     ],
 )
 def test_settings_are_written_beside_none_but_those_of_the_same_scenario(

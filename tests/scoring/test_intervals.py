@@ -296,7 +296,9 @@ def test_only_an_interval_of_seeds_is_above_or_below_a_bar() -> None:
 def test_methods_with_other_numbers_of_runs_are_not_compared() -> None:
     runs = [scores(np.ones((4, 20))) for _ in range(3)]
     for first, second in ((runs, runs[:2]), (runs[:2], runs), ([], [])):
-        with pytest.raises(InputError, match="a run of each seed"):
+        with pytest.raises(
+            InputError, match="runs of the same seeds, in the same order, and at least one run"
+        ):
             bootstrap(
                 lambda rates: rates["one"].success.mean(axis=(-1, -2, -3)),
                 {"one": first, "two": second},

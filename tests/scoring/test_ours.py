@@ -142,7 +142,7 @@ def test_relearning_that_fails_counts_with_all_the_steps_of_a_stage(scores: Call
 @pytest.mark.parametrize(
     ("relearning", "ends", "words"),
     [
-        (Relearning("target_0", 3, 14, True), (8, 12), "'target_0' is no retained skill"),
+        (Relearning("target_0", 3, 14, True), (8, 12), "'target_0' is not a retained skill"),
         (Relearning("skill_0", 11, 14, True), (8, 12), "an impossible number of successes"),
         (Relearning("skill_0", -1, 14, True), (8, 12), "an impossible number of successes"),
         (Relearning("skill_0", 3, 15, True), (8, 12), "are not those of a check"),

@@ -213,7 +213,7 @@ def test_a_perturb_run_without_perturbed_episodes_is_refused(make_record: MakeRe
 
 
 def test_a_tuning_run_with_perturbed_episodes_is_refused(make_record: MakeRecord) -> None:
-    with pytest.raises(RecordError, match="a tuning run has validation episodes alone"):
+    with pytest.raises(RecordError, match="a tuning run has only validation episodes"):
         Scores.from_record(make_record(MATRIX, perturbed=PERTURBED, split="validation"), partial=True)
 
 
@@ -267,10 +267,10 @@ def test_the_order_of_rows_does_not_matter(make_record: MakeRecord) -> None:
         ("stage", 3, "impossible"),
         ("stage", -1, "impossible"),
         ("stage", True, "impossible"),
-        ("stage", 1, "no evaluation point"),
+        ("stage", 1, "not an evaluation point"),
         ("step", 10**30, "impossible"),
         ("step", 1.5, "impossible"),
-        ("step", 100, "no evaluation point"),
+        ("step", 100, "not an evaluation point"),
         ("episode", None, "impossible"),
         ("episode", 1, "twice"),
         ("split", "training", "'training', which is none of validation, test, perturbed"),
@@ -304,7 +304,7 @@ def test_an_episode_at_a_step_between_the_evaluation_points_is_refused(
 ) -> None:
     record = make_record(MATRIX)
     append(record.episodes, 1, 150, "target_0", split, 0, 1, 1.0, 5)
-    with pytest.raises(RecordError, match="stage 1, step 150, which is no evaluation point"):
+    with pytest.raises(RecordError, match="stage 1, step 150, which is not an evaluation point"):
         Scores.from_record(record, partial=True)
 
 
@@ -416,7 +416,7 @@ def test_runs_of_different_layouts_do_not_mix(scores: Callable[..., Scores]) -> 
 def test_a_budget_that_would_take_all_memory_is_refused(name: str, make_record: MakeRecord) -> None:
     record = make_record(MATRIX, groups=(2, 2, 1))
     record.scenario.budget[name] = 10_001
-    with pytest.raises(RecordError, match="tasks x episodes are 5 x 10,001, and 20,000 are the most"):
+    with pytest.raises(RecordError, match="tasks x episodes are 5 x 10,001, and the limit is 20,000"):
         Scores.from_record(record, partial=True)
 
 

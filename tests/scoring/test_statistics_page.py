@@ -122,7 +122,7 @@ def test_the_command_line_shows_the_width_to_expect_of_intervals_before_a_run(
     monkeypatch.setattr(sys, "path", [*sys.path])  # the command adds the working directory
     run_command(scenario, "frozen", seeds=1, records=tmp_path)
     said = " ".join(capsys.readouterr().err.split())
-    end = f"1 of 1 run has a record already. Next: clbench leaderboard --records {tmp_path}"
+    end = f"1 of 1 run already has a record. Next: clbench leaderboard --records {tmp_path}"
     assert said == f"{expected_precision(TOY, 1)} {end}"
 
 

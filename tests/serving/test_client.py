@@ -94,7 +94,9 @@ def test_a_server_that_comes_back_with_another_checkpoint_ends_the_stage() -> No
         for _ in range(2):
             assert served(OBSERVATIONS).shape == (2, 3, 4)
             served.close()
-        with pytest.raises(InputError, match="came back as another one: its metadata differ in checkpoint"):
+        with pytest.raises(
+            InputError, match="is not the one that the stage began with: its metadata differ in checkpoint"
+        ):
             served(OBSERVATIONS)
 
 
@@ -264,7 +266,7 @@ def ending(connection: ServerConnection) -> None:
         (sending(f"{TRACEBACK}{'x' * 10**6}"), r"failed: x{500} \[\.\.\. the output of the server has"),
         (sending(f"{TRACEBACK}{FRAME * 3000}KeyError: 1\n"), r"failed: KeyError: 1$"),
         (sending(b"\xc1"), "does not speak openpi's protocol"),
-        (silent, r"did not answer within 0\.2 seconds: a slower one needs a larger --timeout, .*clients"),
+        (silent, r"did not answer within 0\.2 seconds\. Set a larger --timeout .*clients"),
         (ending, "ended the connection 5 times during one request"),
     ],
 )

@@ -21,7 +21,7 @@ def _still(observations: dict[str, Any]) -> Any:
         ({"executed": -1}, ValueError, "executed must be a whole number from 1, not -1"),
         ({"steps": -5.5}, ValueError, "steps must be a whole number from 0, not -5.5"),
         ({"steps": True}, ValueError, "steps must be a whole number from 0, not True"),
-        ({"data": ["a", 1]}, TypeError, r"data must be words, not \['a', 1\]"),
+        ({"data": ["a", 1]}, TypeError, r"data must be a string, not \['a', 1\]"),
     ],
 )
 def test_what_a_record_cannot_mean_is_refused(

@@ -36,10 +36,10 @@ def test_the_command_scores_stage_after_stage_and_skips_what_is_done(
     assert "is done" in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):
         command(ID, **options, executed=1)
-    assert "with executed 3, not 1. Its record is finished, and never edited." in capsys.readouterr().err
+    assert "with executed 3, not 1. The record is finished and is never edited." in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):
         command(ID, **options, restart=True)
-    assert "has a record already" in capsys.readouterr().err
+    assert "already has a record" in capsys.readouterr().err
 
 
 @pytest.mark.long
@@ -74,7 +74,7 @@ def test_the_command_says_that_no_board_shows_a_tuning_seed(
     with serving(tmp_path, 2) as (address, _):
         resolve("clbench.cli.runs:score")(ID, policy=address, stage=2, **options)
     shown = capsys.readouterr().err
-    assert "It is a tuning run, on validation episodes: no board shows it." in shown
+    assert "This is a tuning run on validation episodes, so no board shows it." in shown
     assert "Next:" not in shown
 
 

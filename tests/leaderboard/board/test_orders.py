@@ -153,7 +153,7 @@ def edit(path: Path, part: str, **values: Any) -> None:
 @pytest.mark.parametrize(
     ("part", "values", "reason"),
     [
-        ("run", {"order": 2}, "it is the record of Toy-v0/sft/seed-0-order-2.json"),
+        ("run", {"order": 2}, "it belongs at Toy-v0/sft/seed-0-order-2.json"),
         ("run", {"order": 6}, "3 targets have orders 0 to 5, not 6"),
         ("run", {"order": 10**12}, "order must be from 0 to 99"),
         (

@@ -159,7 +159,7 @@ FORGERIES = {
     "a changed setting shown as the default": Forgery(
         "recomputed", "record: run: settings do not match ", set_in("run.settings", step_factor=0.5)
     ),
-    "another seed": Forgery("recomputed", "and must be there", set_in("run", seed=7)),
+    "another seed": Forgery("recomputed", "in the folder of records", set_in("run", seed=7)),
     "another method's name": Forgery(
         "recomputed", "record: run: uses do not match joint", set_in("run", method="joint")
     ),

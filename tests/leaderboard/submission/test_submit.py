@@ -77,7 +77,7 @@ def test_a_sound_class_gets_a_row_and_a_place(
     before = path.read_bytes()
     submit("submitted:Mine")
     printed = capsys.readouterr()
-    assert "1 of 1 run has a record already." in printed.err
+    assert "1 of 1 run already has a record." in printed.err
     assert "place 1 of 2; not told apart from another:Twin." in printed.out
     assert path.read_bytes() == before
 
@@ -93,7 +93,10 @@ def test_a_record_of_older_code_is_set_aside_and_kept(capsys: pytest.CaptureFixt
     capsys.readouterr()
     submit("submitted:Mine")
     said = " ".join(capsys.readouterr().err.split())
-    assert "the code of submitted:Mine has changed since. It is renamed to seed-0.json.old" in said
+    assert (
+        "the code of submitted:Mine has changed since this run. The record is renamed to seed-0.json.old"
+        in said
+    )
     assert path.with_name("seed-0.json.old").read_bytes() == before
     assert read_record(path).fingerprint["method"]["source"] != "another"
 

@@ -385,7 +385,7 @@ def test_a_record_elsewhere_is_refused_with_the_option_that_finds_it(
         command(beside, tier="recomputed", scenario=TOY, workers=1)
     assert stopped.value.code == 2
     assert f"{mine} is not below " in (error := capsys.readouterr().err)
-    assert "give --records the folder in which it is SCENARIO/METHOD/seed-N.json" in error
+    assert "set --records to the folder in which the record is SCENARIO/METHOD/seed-N.json" in error
     with pytest.raises(SystemExit, match="2"):
         command(mine, tier="recomputed", records=records.parent, workers=1)
     assert f"{mine} belongs below {records}: add --records {records}." in capsys.readouterr().err
@@ -425,7 +425,7 @@ def test_the_command_prints_json_of_good_and_bad_records(
         ({"checkpoints": Path("nowhere")}, "There is no folder nowhere. --checkpoints names the folder"),
         ({"paths": ["nowhere.json"]}, "There is no record at nowhere.json"),
         ({"paths": []}, "There is no record to verify"),
-        ({"records": Path("elsewhere/records")}, "elsewhere/records: give --records the folder"),
+        ({"records": Path("elsewhere/records")}, "elsewhere/records: set --records to the folder"),
     ],
 )
 def test_a_wrong_word_on_the_command_line_is_named(

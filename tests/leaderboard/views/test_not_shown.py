@@ -146,7 +146,7 @@ def test_a_record_of_another_definition_than_most_of_a_strangers_scenario_is_not
         edit = set_in("fingerprint", "definition", definition)
         add_full("lora", seed, edit=edit, place=f"Toy-v0/lora/seed-{seed}.json")
     for text in shown():
-        reason = "its scenario is not that of most records:"
+        reason = "its definition of the scenario does not match most records:"
         assert f"Toy-v0/lora/seed-2.json: {reason} task skill_0 differ." in flat(text)
         assert f"Toy-v0/lora/seed-5.json: {reason} rule skill_0 differ." in flat(text)
         assert not any(f"Toy-v0/lora/seed-{seed}.json" in flat(text) for seed in (0, 1, 3, 4))
@@ -170,10 +170,10 @@ def test_a_record_of_another_definition_of_a_scenario_of_the_project_is_not_show
         words = "fingerprint.definition must be an object, the parts of its scenario."
         assert f"Fetch-v1/sft/seed-0.json: a record of schema 5: {words}" in flat(text)
         assert "Fetch-v1/sft/seed-1.json" not in flat(text)
-        words = "it was made with another clbench/Fetch-v1"
+        words = "it was made with another definition of clbench/Fetch-v1"
         assert f"Fetch-v1/sft/seed-2.json: {words}: task press, questions differ." in flat(text)
         assert f"Fetch-v1/sft/seed-3.json: {words}: the tasks themselves differ." in flat(text)
-        told = f"Fetch-v1/sft/seed-4.json: {words}: task press differ. Worlds may move otherwise on arm64."
+        told = f"Fetch-v1/sft/seed-4.json: {words}: task press differ. Worlds move differently on arm64."
         assert told in flat(text)
         assert "\x1b" not in text
 
@@ -196,7 +196,7 @@ def test_records_that_are_all_of_arm_make_a_table_that_says_so(
             "All these records were made on arm64, where the simulators behave differently than on x86-64"
             in flat(text)
         )
-        reason = "its scenario is not that of most records: task press differ."
+        reason = "its definition of the scenario does not match most records: task press differ."
         assert f"Fetch-v1/sft/seed-2.json: {reason}" in flat(text)
         assert "Fetch-v1/sft/seed-1.json" not in flat(text)
 
@@ -216,7 +216,7 @@ def test_of_arm_records_only_what_episodes_show_may_differ_and_a_refused_record_
         add_full("sft", seed, edit=edit, scenario="clbench/Fetch-v1", place=f"Fetch-v1/sft/seed-{seed}.json")
     for text in shown():
         assert "All these records were made on arm64" in flat(text)
-        words = "it was made with another clbench/Fetch-v1"
+        words = "it was made with another definition of clbench/Fetch-v1"
         assert f"Fetch-v1/sft/seed-1.json: {words}: {rule} differ." in flat(text)
         assert f"Fetch-v1/sft/seed-2.json: {words}: task press differ." in flat(text)
         assert "Fetch-v1/sft/seed-0.json" not in flat(text)
@@ -253,8 +253,8 @@ def test_a_record_in_another_place_is_refused_though_its_run_has_no_other(
     add_full("sft", 2, np.ones((3, 5)), place="a/more.json")
     pandas.testing.assert_frame_equal(load(four_methods), before)
     for text in shown():
-        assert "a/copy.json: it is the record of Toy-v0/sft/seed-1.json, and must be there." in flat(text)
-        assert "a/more.json: it is the record of Toy-v0/sft/seed-2.json, and must be there." in flat(text)
+        assert "a/copy.json: it belongs at Toy-v0/sft/seed-1.json in the folder of records." in flat(text)
+        assert "a/more.json: it belongs at Toy-v0/sft/seed-2.json in the folder of records." in flat(text)
 
 
 @pytest.mark.long
