@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from tiny import TINY
 
@@ -37,6 +38,13 @@ def test_a_run_looks_up_one_scenario_and_one_method(tmp_path: Path, monkeypatch:
                 monkeypatch.setattr(module, name, counted(name, getattr(module, name)))
     execute(RunSpec(TINY.id, "sft", 0, targets=1), tmp_path / "second")
     assert counts == {"_scenario_at": 1, "load_method": 1}
+
+
+def test_a_seed_of_numpy_becomes_one_that_a_record_can_hold() -> None:
+    seed: Any = np.int64(3)
+    run = RunSpec("clbench/Fetch-v1", "sft", seed)
+    assert run == RunSpec("clbench/Fetch-v1", "sft", 3)
+    assert type(run.seed) is int
 
 
 def test_a_resolved_run_has_all_settings_of_its_record() -> None:
