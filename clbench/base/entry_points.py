@@ -49,7 +49,7 @@ def import_module(module: str, needed_for: str) -> Any:
         UnknownNameError: The module, or a module that it imports, does not exist.
         InputError: A module that is not part of clbench raises an error or exits while it is imported.
     """
-    near = module.removeprefix("./").removesuffix(".py").replace("/", ".")
+    near = _as_module(module)
     hint = f" Did you mean {near + needed_for.removeprefix(module)!r}?" if near != module else ""
     if not is_module(module):
         raise UnknownNameError(f"No module {module!r} can be imported for {needed_for!r}.{hint}")
@@ -70,6 +70,11 @@ def import_module(module: str, needed_for: str) -> Any:
         raise InputError(f"The module {module!r} cannot be imported for {needed_for!r}: {what}") from error
 
 
+def _as_module(path: str) -> str:
+    """Return the name of the module in a file; the name of a module stays as it is."""
+    return path.removeprefix("./").removesuffix(".py").replace("/", ".")
+
+
 def _hint_of_folder(name: str) -> str:
     """Return the end of a message: the nearest module in the working directory, or that there is none."""
     folder = os.getcwd()
@@ -81,7 +86,7 @@ def _hint_of_folder(name: str) -> str:
 
 def class_hint(name: str) -> str:
     """Return the end of a message about a file, a module or a dotted name in place of "module:Class"."""
-    stem = name.removesuffix(".py").removeprefix("./").replace("/", ".")
+    stem = _as_module(name)
     module, _, attribute = stem.rpartition(".")
     if not is_module(stem):
         return ""
@@ -94,14 +99,15 @@ def class_hint(name: str) -> str:
     return ""
 
 
-def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
-    """Return the error for a name that is not `known`, with the nearest known name.
+def unknown(kind: str, name: str, known: Iterable[str], hint: str | None = None) -> UnknownNameError:
+    """Return the error for a name that is not `known`, with a hint.
 
     Args:
         kind: Kind of thing that is named, such as "task".
         name: Unknown name.
         known: Known names.
+        hint: What was probably meant, as sentences after a space; None names the nearest known name.
     """
     known = sorted(known)
-    hint = did_you_mean(name, known)
+    hint = did_you_mean(name, known) if hint is None else hint
     return UnknownNameError(f"No {kind} is called {name!r}.{hint} Known: {', '.join(known)}.")

@@ -18,7 +18,7 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 from torch import Tensor
 
-from clbench.base.cache import cached, hash_of
+from clbench.base.cache import cached, hash_of, is_cached
 from clbench.base.dependencies import versions
 from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError
@@ -211,6 +211,13 @@ def keep_dataset(task: Task, budget: Budget, episodes: Callable[[World], Sequenc
             _write_dataset(partial / "data", name, task, world, episodes(world))
 
     return cached(folder, dataset_inputs(task, budget), make)
+
+
+def has_dataset(task: Task, budget: Budget) -> bool:
+    """Return whether Minari's folder holds the task's whole dataset, of this version of task and clbench."""
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    return is_cached(get_dataset_path(dataset_id(task, budget)), dataset_inputs(task, budget))
 
 
 def _declare_namespaces(folder: Path, dataset_id: str) -> None:

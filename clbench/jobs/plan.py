@@ -6,10 +6,9 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from clbench.base.cache import is_cached
 from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError
-from clbench.data.demonstrations import dataset_id, dataset_inputs
+from clbench.data.demonstrations import has_dataset
 from clbench.evaluation.definition import recording_of
 from clbench.jobs import work
 from clbench.jobs.job import Job, Product
@@ -249,12 +248,8 @@ def _check_recording(task: Task, budget: Budget) -> None:
     Raises:
         InputError: They are missing, and only their file can provide them.
     """
-    from minari.storage.datasets_root_dir import get_dataset_path
-
     recording = recording_of(task)
-    if recording is None or is_cached(
-        get_dataset_path(dataset_id(task, budget)), dataset_inputs(task, budget)
-    ):
+    if recording is None or has_dataset(task, budget):
         return
     raise InputError(
         f"The task {task.name} learns from the recording {recording}, and this machine has no such dataset "

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 
-from clbench.base.entry_points import class_hint
+from clbench.base.entry_points import class_hint, unknown
 from clbench.base.errors import InputError, UnknownNameError
 from clbench.base.text import did_you_mean, quoted
 from clbench.spec.fields import LONGEST
@@ -79,7 +79,7 @@ def unknown_scenario(name: str) -> UnknownNameError:
         hint += f" The module {module!r} was imported, and does not register it."
     elif "/" in name and name.partition("/")[0] != "clbench":
         hint += f" If a module of yours registers it, name the module too, as {f'module:{name}'!r}."
-    return UnknownNameError(f"No scenario is called {name!r}.{hint} Known: {', '.join(known)}.")
+    return unknown("scenario", name, known, hint)
 
 
 def unknown_method(name: str) -> UnknownNameError:

@@ -82,9 +82,7 @@ def _unknown_policy(name: str) -> UnknownNameError:
         hint = " `clbench score` plays a policy behind a server: docs/guide/external.md."
     else:
         hint = did_you_mean(name, known) or class_hint(name)
-    return UnknownNameError(
-        f"No policy is called {name!r}.{hint} Known: {', '.join(known)}, or module:Class."
-    )
+    return unknown("policy", name, [*known, "module:Class"], hint)
 
 
 def policy_packages(policy: str) -> list[str]:
