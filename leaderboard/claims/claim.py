@@ -113,7 +113,7 @@ def claim(
     scenarios: tuple[str, ...] = BOARDS,
     uncounted: str = "",
 ) -> Callable[[Callable[[Evidence], Finding]], Claim]:
-    """Return a decorator that turns the function that judges a claim into it; its docstring is the claim."""
+    """Return a decorator for the function that judges a claim; the docstring of the function is the claim."""
 
     def enter(judge: Callable[[Evidence], Finding]) -> Claim:
         words = " ".join((judge.__doc__ or "").split())
