@@ -1,21 +1,25 @@
-"""The page of the claims and their table in the terminal. The same findings give the same bytes."""
+"""The page of the claims, their section in the findings, and their table in the terminal.
+
+The same findings give the same bytes.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from rich.box import SIMPLE_HEAD
-from rich.table import Table
+from rich.table import Table as TerminalTable
 from rich.text import Text
 
 from clbench.base.text import counted, listed
 
 from ..board.commands import run_command
 from ..board.summary import grouped
-from ..claims.claim import tally
+from ..claims.claim import DECIDED, KNOWLEDGE, Claim, tally
 from ..claims.evidence import LEAST_SEEDS, Figure
 from ..claims.judges import Judged
 from ..views.format import MISSING, format_interval
+from ..views.sections import Section, Table, short
 from ..views.templating import template
 
 CHECKS = {"replayed": "replayed {}", "retrained": "repeated {} as a whole"}
@@ -29,7 +33,7 @@ def page(judged: Sequence[Judged]) -> str:
     return template(__file__, "claims.md.jinja").render(
         seeds=LEAST_SEEDS,
         tally=_tally(judged),
-        judged=judged,
+        verdicts=verdicts(judged),
         papers=grouped((claim.paper, (claim, members)) for claim, members in by_claim.items()).items(),
         not_used=list(refused.values()),
         missing=_missing,
@@ -90,9 +94,88 @@ def figure_text(figure: Figure) -> str:
     return format_interval(figure.estimate, figure.form)
 
 
-def terminal(judged: Sequence[Judged]) -> Table:
+def verdicts(judged: Sequence[Judged]) -> Table:
+    """Return the table of the claims: what is measured, and on each board the verdict with its value."""
+    boards = tuple(dict.fromkeys(one.evidence.scenario for one in judged))
+    found = grouped((one.claim, one) for one in judged)
+    lines = tuple(_verdict_line(claim, members, boards) for claim, members in found.items())
+    return Table(("id", "claim", "measured quantity", *map(short, boards)), lines)
+
+
+def _verdict_line(claim: Claim, judged: Sequence[Judged], boards: Sequence[str]) -> tuple[str, ...]:
+    figures = [one.finding.figures[0] for one in judged if one.finding.figures]
+    what = figures[0].what if figures else MISSING
+    cells = {one.evidence.scenario: _verdict_cell(one, what) for one in judged}
+    return (claim.id, claim.words, what, *(cells.get(board, "") for board in boards))
+
+
+def _verdict_cell(one: Judged, what: str) -> str:
+    """Return a verdict with the value of its first figure, if that is the figure `what`."""
+    shown = [figure for figure in one.finding.figures[:1] if figure.what == what]
+    return ": ".join([one.finding.verdict, *map(figure_text, shown)])
+
+
+# ---- the section of the findings ---------------------------------------------------------------------------
+
+HOW_IT_WAS_MADE = (
+    "FetchKnowledge-v1 was made to show claims on knowledge: its steps are large, and training goes on long "
+    "after the target is learned."
+)
+
+UNDECIDED = (
+    "A claim is undecided if runs are missing or intervals are too wide. It cannot be shown if a condition "
+    "of its rule is missing."
+)
+
+
+def claims_section(judged: Sequence[Judged]) -> Section:
+    """Return which claims of the papers hold, on which board, and what explains it."""
+    answers = [
+        f"{paper} has {tally(one.finding.verdict for one in every if not one.claim.uncounted)}."
+        f"{_uncounted(every)}"
+        for paper, every in grouped((one.claim.paper.name, one) for one in judged).items()
+    ]
+    explained = Table(("claim", "scenario", "verdict", "what explains it"), tuple(_explanations(judged)))
+    tables = [table for table in (_plain(verdicts(judged)), explained) if table.lines]
+    is_made = any(one.claim.scenarios == KNOWLEDGE for one in judged)
+    notes = (UNDECIDED, HOW_IT_WAS_MADE) if is_made else (UNDECIDED,)
+    question = "Which claims of the papers hold here?"
+    return Section(question, tuple(answers), tuple(tables), notes if answers else ())
+
+
+def _plain(table: Table) -> Table:
+    """Return the table of the verdicts without its figures, which the page of the claims has."""
+    head = (*table.head[:2], *table.head[3:])
+    lines = ((*line[:2], *(cell.partition(":")[0] for cell in line[3:])) for line in table.lines)
+    return Table(head, tuple(lines))
+
+
+def _explanations(judged: Sequence[Judged]) -> list[tuple[str, ...]]:
+    """Return the last conclusion from the figures and controls of each verdict that is a yes or a no."""
+    told = grouped(
+        ((one.claim.id, one.finding.verdict, sentence), short(one.evidence.scenario))
+        for one in judged
+        if one.finding.verdict in DECIDED
+        for sentence in one.finding.sentences[-1:]
+    )
+    return [(claim, listed(boards), verdict, sentence) for (claim, verdict, sentence), boards in told.items()]
+
+
+def _uncounted(judged: Sequence[Judged]) -> str:
+    """Return in a sentence which claims are not counted, and why."""
+    found = grouped((one.claim, one.finding.verdict) for one in judged if one.claim.uncounted)
+    return "".join(
+        f" {claim.id} is {claim.uncounted} and is not counted; it has {tally(given)}."
+        for claim, given in found.items()
+    )
+
+
+# ---- the terminal ------------------------------------------------------------------------------------------
+
+
+def terminal(judged: Sequence[Judged]) -> TerminalTable:
     """Return the short table: claim, scenario, verdict and the first figure."""
-    table = Table(box=SIMPLE_HEAD, padding=0, pad_edge=False)
+    table = TerminalTable(box=SIMPLE_HEAD, padding=0, pad_edge=False)
     table.add_column("id")
     table.add_column("scenario", no_wrap=True)
     table.add_column("verdict", no_wrap=True)

@@ -1,11 +1,11 @@
-"""Sentences and the table of the findings on gains over tuned fine-tuning."""
+"""Sections of the findings on gains over tuned fine-tuning, and their picture."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
-from clbench.base.text import counted
+from clbench.base.text import counted, listed, megabytes
 from clbench.scoring.groups import differences_needed
 from clbench.scoring.intervals import Estimate
 from clbench.spec.references import BASELINE
@@ -13,7 +13,8 @@ from clbench.spec.references import BASELINE
 from ..board.frontier import TiedGain, side_of_zero
 from ..board.rows import Row, apart_from_baseline, certain_sides, told_above
 from ..board.summary import RANKED_BY, WITHOUT_DEMONSTRATIONS, competing
-from ..views.format import MISSING, format_interval, over_tied, rate_text
+from ..views.format import MISSING, format_interval, gain_text, number_text, rate_text
+from ..views.sections import Section, Table, short
 
 Tied = Mapping[str, Mapping[str, Sequence[TiedGain]]]
 """Gains over plain fine-tuning at tied settings by scenario and method: `Board.tied`."""
@@ -26,88 +27,107 @@ def by_gain(rows: Iterable[Row]) -> list[Row]:
     return sorted(known, key=lambda row: -(row.estimates["gain"].value or 0.0))
 
 
-def gain_table(
-    boards: Mapping[str, Sequence[Row]], tied: Tied
-) -> tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]:
-    """Return the heads and the lines of the table: with a column for tied settings if there are any."""
-    has_tied = any(gains for name in boards for gains in tied.get(name, {}).values())
-    lines = []
-    for name, rows in boards.items():
-        for row in by_gain(rows):
-            over = [format_interval(one.gain, ".3f") for one in tied.get(name, {}).get(row.method, ())]
-            lines.append(
-                (
-                    name,
-                    row.method,
-                    format_interval(row.estimates["gain"], ".3f"),
-                    *(["; ".join(over) or MISSING] if has_tied else []),
-                    *(format_interval(row.estimates[one]) for one in ("adaptation", "kept")),
-                    str(len(row.seeds)),
-                )
-            )
-    over_a_tied = ("gain over the tied setting",) if has_tied else ()
-    return ("scenario", "method", "gain", *over_a_tied, "learned", "kept", "seeds"), tuple(lines)
+# ---- without prior demonstrations --------------------------------------------------------------------------
+
+FAMILY = (
+    "Methods are told apart from plain fine-tuning by Tukey's test of all methods without prior "
+    "demonstrations on the scenario. The last column has the other gains whose own intervals exclude 0; they "
+    "are not corrected for the number of methods."
+)
 
 
-def gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]]) -> Iterator[str]:
-    """Yield what Tukey's test of all rows without prior demonstrations says about each gain.
+def gains_section(boards: Mapping[str, Sequence[Row]], tied: Tied) -> Section:
+    """Return whether any method beats tuned fine-tuning without prior demonstrations.
 
     Args:
-        name: Name of the scenario.
-        rows: Its rows.
-        tied: Gains over plain fine-tuning at tied settings, by method.
+        boards: Rows of each scenario at equal learning.
+        tied: Gains over plain fine-tuning at tied settings.
     """
-    others = [row for row in by_gain(rows) if row.division in WITHOUT_DEMONSTRATIONS]
-    if not others or BASELINE not in {row.method for row in rows}:
-        return
+    judged = {name: rows for name, rows in boards.items() if _without_demonstrations(rows)}
+    answers, undistinguished = [], []
+    for name, rows in judged.items():
+        found = list(_certain_gains(name, rows, tied.get(name, {})))
+        answers += found
+        undistinguished += [] if found else [short(name)]
+    if undistinguished:
+        where = listed(undistinguished)
+        answers.insert(0, f"On {where}, no method is above plain fine-tuning and told apart from it.")
+    for name in judged:
+        answers += _over_tied_settings(name, tied.get(name, {}))
+    head = ("scenario", "compared", "largest gain", "smallest gain that is told apart", "told apart")
+    lines = tuple(_gain_line(name, rows, tied.get(name, {})) for name, rows in judged.items())
+    tables = (Table((*head, "only by the own interval"), lines),) if lines else ()
+    question = "Does a method without prior demonstrations beat tuned fine-tuning?"
+    picture = "gains" if any(by_gain(rows) for rows in boards.values()) else ""
+    return Section(question, tuple(answers), tables, (FAMILY,) if lines else (), picture)
+
+
+def _without_demonstrations(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows to compare with plain fine-tuning, by falling gain; none if it has no row."""
+    has_baseline = any(row.method == BASELINE for row in rows)
+    return [row for row in by_gain(rows) if has_baseline and row.division in WITHOUT_DEMONSTRATIONS]
+
+
+def _certain_gains(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]]) -> Iterator[str]:
+    """Yield the gains that are told apart from 0: first those that are certain, then the others."""
+    gains = {row.method: row.estimates["gain"] for row in _without_demonstrations(rows)}
+    better = [row.method for row in told_above(rows) if row.method in gains]
+    sides = certain_sides(rows, tied)
+    certain = [method for method in better if sides.get(method) == 1]
+    if certain:
+        named = ", ".join(f"`{method}` by {format_interval(gains[method], '.3f')}" for method in certain)
+        yield f"On {short(name)}, yes: {named}."
+    for method in better:
+        if method not in certain or tied.get(method):
+            yield gain_text(short(name), f"`{method}`", gains[method], tied.get(method, ()))
+
+
+def _gain_line(
+    name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]]
+) -> tuple[str, str, str, str, str, str]:
+    """Return the cells of a scenario."""
+    others = _without_demonstrations(rows)
     gains = {row.method: row.estimates["gain"] for row in others}
     apart = apart_from_baseline(rows)
-    better = {row.method: row.estimates["gain"] for row in told_above(rows) if row.method in gains}
-    sides = certain_sides(rows, tied)
-    certain = {method: gain for method, gain in better.items() if sides.get(method) == 1}
-    if certain:
-        yield f"On {name}, yes: {_listed(certain)}."
-    for method in better:
-        yield from over_tied(name, f"`{method}`", gains[method], tied.get(method, ()))
-    if not better:
-        best = next(iter(gains))
-        which = f"the gain of `{best}` is"
-        if len(gains) > 1:
-            which = f"the largest gain of {len(gains)} methods is that of `{best}`,"
-        yield (
-            f"On {name}, no method is above plain fine-tuning and told apart from it: {which} "
-            f"{format_interval(gains[best], '.3f')}. {_power(rows, gains)}"
-        )
-    alone = "only by the interval of the gain itself"
-    if len(gains) > 1:
-        alone += f" (not corrected for {len(gains)} comparisons)"
-    higher = {method: gain for method, gain in gains.items() if gain.is_above(0) and method not in better}
-    over_both = {
-        method: gain for method, gain in higher.items() if side_of_zero(gain, tied.get(method, ())) == 1
-    }
-    if over_both:
-        yield f"On {name}, above plain fine-tuning {alone}: {_listed(over_both)}."
-    if len(over_both) < len(higher):
-        rest = {method: gain for method, gain in higher.items() if method not in over_both}
-        yield f"On {name}, above only the setting that tuning chose for sft, and {alone}: {_listed(rest)}."
-    losses = _losses(gains)
-    worse = {method: loss for method, loss in losses.items() if method in apart}
-    if worse:
-        listed = f"{_listed(worse)}{_unlearned(rows, worse)}"
-        yield f"On {name}, below plain fine-tuning and told apart from it: {listed}."
-    if len(worse) < len(losses):
-        rest = {method: loss for method, loss in losses.items() if method not in worse}
-        yield f"On {name}, below plain fine-tuning {alone}: {_listed(rest)}."
-    yield from _over_tied_settings(name, tied)
-
-
-def _losses(gains: Mapping[str, Estimate]) -> dict[str, Estimate]:
-    """Return the gains that are below 0 by their own intervals, with the other sign."""
-    return {
-        method: Estimate(-gain.value, -gain.high, -gain.low)
+    best = next(iter(gains))
+    told = [
+        f"{_named(method, gains[method])}{_unlearned(others, method)}" for method in gains if method in apart
+    ]
+    alone = [
+        f"{_named(method, gain)}{_lost_over_tied(gain, tied.get(method, ()))}"
         for method, gain in gains.items()
-        if gain.value is not None and gain.low is not None and gain.high is not None and gain.is_below(0)
-    }
+        if method not in apart and (gain.is_above(0) or gain.is_below(0))
+    ]
+    compared = f"{counted(len(gains), 'method')}, {counted(len(others[0].seeds), 'seed')}"
+    needed = _smallest_told_apart(rows, gains)
+    return (
+        *(short(name), compared, _named(best, gains[best]), needed),
+        *("; ".join(told) or MISSING, "; ".join(alone) or MISSING),
+    )
+
+
+def _named(method: str, gain: Estimate) -> str:
+    return f"`{method}` {format_interval(gain, '.3f')}"
+
+
+def _lost_over_tied(gain: Estimate, tied: Sequence[TiedGain]) -> str:
+    """Return a remark on a gain that is above the chosen setting of plain fine-tuning, but not a tied one."""
+    return " (not over the tied setting)" if gain.is_above(0) and side_of_zero(gain, tied) != 1 else ""
+
+
+def _unlearned(rows: Iterable[Row], method: str) -> str:
+    """Return a remark on a method some of whose stages ended without the criterion."""
+    met = next(row.estimates["criterion_met"].value for row in rows if row.method == method)
+    return "" if met is None or met == 1 else f" ({1 - met:.0%} of its stages missed the criterion)"
+
+
+def _smallest_told_apart(rows: Iterable[Row], methods: Collection[str]) -> str:
+    """Return the gain, or the range of gains, that the test of these methods could just tell from 0."""
+    family = {row.method: row.scores for row in rows if row.method in methods or row.method == BASELINE}
+    needed = differences_needed(RANKED_BY, family, BASELINE)
+    if not needed or not math.isfinite(max(needed.values())):
+        return MISSING
+    return " to ".join(dict.fromkeys(f"{end:.3f}" for end in (min(needed.values()), max(needed.values()))))
 
 
 def _over_tied_settings(name: str, tied: Mapping[str, Sequence[TiedGain]]) -> Iterator[str]:
@@ -116,37 +136,75 @@ def _over_tied_settings(name: str, tied: Mapping[str, Sequence[TiedGain]]) -> It
     Methods below it are not named: they, too, have tied settings, of which the board has only one.
     """
     for one in tied.get(BASELINE, ()):
-        more = _losses({BASELINE: one.gain}).get(BASELINE)
-        if more is not None:
+        value, low, high = one.gain.value, one.gain.low, one.gain.high
+        if one.gain.is_below(0) and value is not None and low is not None and high is not None:
+            more = Estimate(-value, -high, -low)
             yield (
-                f"On {name}, tuning rated plain fine-tuning at {rate_text(one.factor)} as highly as at the "
-                f"chosen one. In the test episodes of {counted(one.seeds, 'seed')} it ends "
+                f"On {short(name)}, tuning rated plain fine-tuning at {rate_text(one.factor)} as highly as "
+                f"at the chosen one. In the test episodes of {counted(one.seeds, 'seed')} it ends "
                 f"{format_interval(more, '.3f')} higher than at the chosen one, so every gain on this board "
                 "is smaller when it is measured over the tied setting."
             )
 
 
-def _unlearned(rows: Iterable[Row], methods: Collection[str]) -> str:
-    """Return the end of a sentence on methods some of whose stages ended without the criterion."""
-    shares = {row.method: row.estimates["criterion_met"].value for row in rows if row.method in methods}
-    told = [
-        f"{1 - met:.0%} of the stages of `{method}` never met the criterion"
-        for method, met in shares.items()
-        if met is not None and met < 1
-    ]
-    return f"; {', '.join(told)}" if told else ""
+# ---- with prior demonstrations -----------------------------------------------------------------------------
+
+WHAT_IS_KEPT = (
+    "Replay and `a_gem` keep demonstrations between stages; `ewc` and `fast_dvla` keep vectors as large as "
+    "the policy, which they make from demonstrations before the first stage."
+)
+
+OWN_RATES = (
+    "Each method has the learning rate that tuning chose for it. A smaller rate takes more steps, so a "
+    "difference in steps need not come from the demonstrations. A stage that misses the criterion counts as "
+    "the full budget of steps."
+)
 
 
-def _power(rows: Iterable[Row], methods: Collection[str]) -> str:
-    """Return the sentence on the differences that the test of these methods cannot show."""
-    family = {row.method: row.scores for row in rows if row.method in methods or row.method == BASELINE}
-    needed = differences_needed(RANKED_BY, family, BASELINE)
-    if not needed or not math.isfinite(max(needed.values())):
-        return ""
-    ends = [f"{end:.3f}" for end in (min(needed.values()), max(needed.values()))]
-    between = ends[0] if ends[0] == ends[1] else f"{ends[0]} to {ends[1]}, depending on the method"
-    return f"To be told apart, a gain must exceed {between}."
+def replay_section(boards: Mapping[str, Sequence[Row]], tied: Tied) -> Section:
+    """Return what prior demonstrations buy, and what they cost.
+
+    Args:
+        boards: Rows of each scenario at equal learning.
+        tied: Gains over plain fine-tuning at tied settings.
+    """
+    lines: list[tuple[str, ...]] = []
+    certain: list[bool] = []
+    for name, rows in boards.items():
+        sides = certain_sides(rows, tied.get(name, {}))
+        members = [row for row in by_gain(rows) if _keeps_data(row)]
+        certain += [sides.get(row.method) == 1 for row in members]
+        lines += [_replay_line(row, "" if row.method in sides else " (not certain)") for row in members]
+        lines += [_replay_line(row) for row in rows if row.method == BASELINE and members]
+    question = "What do prior demonstrations buy?"
+    if not lines:
+        return Section(question, ())
+    answer = (
+        f"In {sum(certain)} of {counted(len(certain), 'comparison')}, a method that reads prior "
+        "demonstrations certainly gains over plain fine-tuning."
+    )
+    head = (
+        "scenario",
+        "method",
+        "gain",
+        "kept between stages",
+        "steps to learn a target",
+        "stages that missed",
+    )
+    return Section(question, (answer,), (Table(head, tuple(lines)),), (WHAT_IS_KEPT, OWN_RATES))
 
 
-def _listed(estimates: Mapping[str, Estimate]) -> str:
-    return ", ".join(f"`{name}` by {format_interval(one, '.3f')}" for name, one in estimates.items())
+def _keeps_data(row: Row) -> bool:
+    return row.division not in WITHOUT_DEMONSTRATIONS and bool(row.costs.get("bytes_kept"))
+
+
+def _replay_line(row: Row, doubt: str = "") -> tuple[str, ...]:
+    """Return the cells of a method; `doubt` follows its gain."""
+    kept, met = row.costs.get("bytes_kept"), row.estimates["criterion_met"].value
+    return (
+        *(short(row.scenario), f"`{row.method}`"),
+        MISSING if row.method == BASELINE else f"{format_interval(row.estimates['gain'])}{doubt}",
+        megabytes(int(kept or 0)),
+        format_interval(row.estimates["steps_to_criterion"], ".0f"),
+        number_text(None if met is None else 1 - met, ".0%"),
+    )

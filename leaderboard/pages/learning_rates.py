@@ -1,8 +1,9 @@
-"""Sentences of the findings on smaller learning rates: what they keep, without any method."""
+"""Section of the findings on smaller learning rates: what they keep, without any method."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 from clbench.base.text import counted
 from clbench.spec.references import BASELINE, FROZEN
@@ -11,113 +12,121 @@ from ..board.frontier import Curve, Rung
 from ..board.rows import Row
 from ..board.summary import WITHOUT_DEMONSTRATIONS
 from ..claims.evidence import Evidence, rung
-from ..views.format import format_interval, rate_text
+from ..views.format import MISSING, format_interval, rate_text
+from ..views.sections import Section, Table, short
 
 Curves = Mapping[str, Sequence[Curve]]
 
+NOTES = (
+    "Rates and methods marked as best were chosen on the same episodes, so differences from them are biased "
+    "upwards. All differences are paired by seed.",
+    f"`{FROZEN}` learns nothing. A target that was never learned counts as not kept.",
+    "Factors multiply the scenario's learning rate. The leaderboard has all of them, with intervals.",
+)
 
-def rate_sentences(
+
+def rates_section(
     frontiers: Curves, boards: Mapping[str, Sequence[Row]], evidence: Callable[[str], Evidence]
-) -> Iterator[str]:
-    """Yield what plain fine-tuning and other methods keep at the rates of the ladder.
+) -> Section:
+    """Return what plain fine-tuning and other methods keep at the rates of the ladder.
 
     Args:
         frontiers: Curves of each scenario with a ladder.
         boards: Rows of each scenario with the default policy.
         evidence: Returns the runs of the scenario with a Gymnasium id, those of the ladder included.
     """
-    for name, curves in frontiers.items():
-        found = evidence(name)
-        for curve in curves:
-            if curve.is_baseline:
-                yield _of_the_baseline(name, curve, found)
-                yield from _at_the_first_rung(name, curve, curves, found)
-                yield from _of_frozen(name, curve, boards.get(name, []), found)
-
-
-def rate_lines(frontiers: Curves) -> Iterator[tuple[str, ...]]:
-    """Yield the cells of the table: scenario, method, factor, learned, kept and the number of seeds."""
-    for name, curves in frontiers.items():
-        for curve in curves:
-            for one in curve.rungs:
-                learned, kept = format_interval(one.learned), format_interval(one.kept)
-                yield name, curve.method, f"{one.factor:g}", learned, kept, str(len(one.seeds))
-
-
-def _of_the_baseline(name: str, curve: Curve, evidence: Evidence) -> str:
-    """Return what plain fine-tuning keeps at the first rung, and at the one where it keeps most."""
-    first, best = curve.rungs[0], _best(curve)
-    more = ""
-    if best is not first:
-        more = (
-            f", and {format_interval(best.kept)} at {rate_text(best.factor)}, where it learns "
-            f"{format_interval(best.learned)}"
-        )
-        more += f". {_gain_of_a_rate(first, best, len(curve.rungs), evidence)}"
-    kept = format_interval(first.kept)
-    return f"On {name}, plain fine-tuning keeps {kept} at {rate_text(first.factor)}{more}."
-
-
-def _gain_of_a_rate(first: Rung, best: Rung, rates: int, evidence: Evidence) -> str:
-    """Return what the rate that keeps most gains over the first one, seed by seed."""
-    gain = evidence.difference("kept", *(rung(BASELINE, one.factor) for one in (best, first))).estimate
-    certain = "" if gain.is_above(0) else ", which is not certain"
-    return (
-        f"The difference, seed by seed, is {format_interval(gain)}{certain}; it is biased upwards, because "
-        f"this rate was chosen as the best of {rates} on the same episodes"
-    )
-
-
-def _at_the_first_rung(
-    name: str, baseline: Curve, curves: Sequence[Curve], evidence: Evidence
-) -> Iterator[str]:
-    """Yield what the methods without prior demonstrations keep at the learning rate of the first rung.
-
-    The one that keeps most is compared with plain fine-tuning there, and at its best rate.
-    """
-    factor = baseline.rungs[0].factor
-    kept = {
-        curve.method: curve.rungs[0].kept
+    found = [
+        _Ladder(name, curve, curves, boards.get(name, ()), evidence(name))
+        for name, curves in frontiers.items()
         for curve in curves
-        if curve.division in WITHOUT_DEMONSTRATIONS
-        and curve is not baseline
-        and curve.rungs[0].factor == factor
-    }
-    if kept:
-        falling = sorted(kept, key=lambda method: -(kept[method].value or 0.0))
-        listed = ", ".join(f"`{method}` {format_interval(kept[method])}" for method in falling)
-        best = _best(baseline)
-        over = [
-            f"{_kept_more(evidence, rung(falling[0], factor), rung(BASELINE, other))} more than plain "
-            f"fine-tuning at {rate_text(other)}"
-            for other in dict.fromkeys((factor, best.factor))
-        ]
-        yield (
-            f"On {name}, this is what methods without prior demonstrations keep at {rate_text(factor)}: "
-            f"{listed}. The first of them, `{falling[0]}`, keeps {' and '.join(over)}. This method, the best "
-            f"of {len(falling)}, and the rate of plain fine-tuning were both chosen on the same episodes."
+        if curve.is_baseline
+    ]
+    question = "How much does a smaller learning rate achieve on its own?"
+    if not found:
+        return Section(question, ())
+    columns = [one.cells() for one in found]
+    lines = tuple((label, *(column[label] for column in columns)) for label in columns[0])
+    table = Table(("kept", *(short(one.name) for one in found)), lines)
+    return Section(question, tuple(one.answer() for one in found), (table,), NOTES, "rates")
+
+
+@dataclass(frozen=True)
+class _Ladder:
+    """Plain fine-tuning at several learning rates on one scenario, beside the other methods."""
+
+    name: str
+    baseline: Curve
+    curves: Sequence[Curve]
+    rows: Sequence[Row]
+    evidence: Evidence
+
+    @property
+    def first(self) -> Rung:
+        """Its largest learning rate, that of the scenario."""
+        return self.baseline.rungs[0]
+
+    @property
+    def best(self) -> Rung:
+        """The learning rate at which it keeps most."""
+        return max(self.baseline.rungs, key=lambda one: one.kept.value or 0.0)
+
+    def answer(self) -> str:
+        """Return what its best learning rate gains."""
+        gain = self.evidence.difference(
+            "kept", *(rung(BASELINE, one.factor) for one in (self.best, self.first))
+        )
+        certain = "" if gain.estimate.is_above(0) else ", which is not certain"
+        at = rate_text(self.best.factor)
+        if self.best is self.first:
+            return f"On {short(self.name)}, plain fine-tuning keeps most at {at}."
+        return (
+            f"On {short(self.name)}, plain fine-tuning at {at} keeps {format_interval(gain.estimate)} more "
+            f"than at {rate_text(self.first.factor)}{certain}, and learns "
+            f"{format_interval(self.best.learned)}."
         )
 
+    def cells(self) -> dict[str, str]:
+        """Return what is kept, and the differences, by their labels."""
+        first, best = (rung(BASELINE, one.factor) for one in (self.first, self.best))
+        others = self._others()
+        rival = others[0] if others else None
+        label = rung(rival.method, self.first.factor) if rival else ""
+        frozen = next((row.estimates["kept"] for row in self.rows if row.method == FROZEN), None)
+        return {
+            "plain fine-tuning at the largest rate": _at(self.first),
+            "plain fine-tuning at its best rate": f"{_at(self.best)}, best of {len(self.baseline.rungs)}",
+            "best method without prior demonstrations at the largest rate": (
+                f"`{rival.method}` {format_interval(rival.rungs[0].kept)}, "
+                f"best of {counted(len(others), 'method')}"
+                if rival
+                else MISSING
+            ),
+            "this method minus plain fine-tuning at the largest rate": self._more(label, first),
+            "this method minus plain fine-tuning at its best rate": self._more(label, best),
+            f"`{FROZEN}`": format_interval(frozen) if frozen else MISSING,
+            f"plain fine-tuning at its best rate minus `{FROZEN}`": self._more(
+                best, FROZEN if frozen else ""
+            ),
+        }
 
-def _best(curve: Curve) -> Rung:
-    """Return the rung at which a method keeps most."""
-    return max(curve.rungs, key=lambda one: one.kept.value or 0.0)
+    def _others(self) -> list[Curve]:
+        """Return the methods without prior demonstrations that ran at the largest rate, by what they keep."""
+        found = [
+            curve
+            for curve in self.curves
+            if curve.division in WITHOUT_DEMONSTRATIONS
+            and not curve.is_baseline
+            and curve.rungs[0].factor == self.first.factor
+        ]
+        return sorted(found, key=lambda curve: -(curve.rungs[0].kept.value or 0.0))
+
+    def _more(self, method: str, other: str) -> str:
+        """Return how much more a method keeps than another, seed by seed, with the number of seeds."""
+        if not method or not other:
+            return MISSING
+        found = self.evidence.difference("kept", method, other)
+        return f"{format_interval(found.estimate)}, {counted(len(found.seeds), 'seed')}"
 
 
-def _kept_more(evidence: Evidence, method: str, other: str) -> str:
-    """Return how much more a method keeps than another, seed by seed."""
-    return format_interval(evidence.difference("kept", method, other).estimate)
-
-
-def _of_frozen(name: str, baseline: Curve, rows: Sequence[Row], evidence: Evidence) -> Iterator[str]:
-    """Yield what a policy that learns nothing keeps by this measure, and whether fine-tuning keeps more."""
-    for row in rows:
-        if row.method == FROZEN:
-            best = _best(baseline)
-            more = evidence.difference("kept", rung(BASELINE, best.factor), FROZEN)
-            yield (
-                f"On {name}, `{FROZEN}`, which learns nothing, keeps "
-                f"{format_interval(row.estimates['kept'])} by this measure: a target that was never learned "
-                f"counts as not kept. Plain fine-tuning at {rate_text(best.factor)}, chosen as above, keeps "
-                f"{format_interval(more.estimate)} more ({counted(len(more.seeds), 'seed')}, seed by seed)."
-            )
+def _at(one: Rung) -> str:
+    return f"{format_interval(one.kept)} at factor {one.factor:g}"

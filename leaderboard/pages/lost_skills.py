@@ -1,4 +1,4 @@
-"""Sentences of the findings on skills that are lost: how fast they come back."""
+"""Section of the findings on skills that are lost: how fast they come back."""
 
 from __future__ import annotations
 
@@ -12,49 +12,44 @@ from clbench.scoring.intervals import mean_of_seeds
 from clbench.spec.references import BASELINE, FROM_SCRATCH
 
 from ..board.rows import Row
-from ..views.format import format_interval
+from ..views.format import MISSING, format_interval
+from ..views.sections import Section, Table, short
 
 LOST = 0.5
 """Share of its validation episodes below which a skill counts as lost."""
 
-LOST_MEANS = (
+NOTES = (
     "Here, a skill counts as lost if the policy succeeds in fewer than half of its validation episodes after "
-    "the last target. Each run measures only the skill with the fewest successes."
+    "the last target. Each run measures only the skill with the fewest successes.",
+    "The steps are those on the skill's demonstrations until the policy meets the criterion again; without "
+    "it, they are the full budget of a stage. A policy without pretraining has learned the targets.",
 )
 
 
-def relearning_sentences(boards: Mapping[str, Sequence[Row]]) -> list[str]:
+def lost_skills_section(boards: Mapping[str, Sequence[Row]]) -> Section:
     """Return how fast the skill that succeeds least comes back, on each board where it was measured."""
-    answers = []
+    losses, lines = [], []
     for name, rows in boards.items():
         by_method = {row.method: row for row in rows}
         measured = _measured(by_method.get(BASELINE))
-        if not measured:
-            continue
-        lost = [found for found, share in measured if share < LOST]
-        seeds = counted(len(measured), "seed")
-        if len(lost) < 2:
-            answers.append(f"On {name}, plain fine-tuning loses a skill in {len(lost)} of {seeds}.")
-            continue
-        answers.append(
-            f"On {name}, plain fine-tuning loses a skill in {len(lost)} of {seeds} ({_skills(lost)}). "
-            f"The policy meets the criterion again after {_steps(lost)} steps on the skill's "
-            f"demonstrations{_never_again(lost)}."
-            f"{_without_pretraining(by_method.get(FROM_SCRATCH), lost)}"
-        )
-    if answers:
-        answers.insert(0, LOST_MEANS)
-    return answers
+        if measured:
+            lost = [found for found, share in measured if share < LOST]
+            losses.append(f"{len(lost)} of {counted(len(measured), 'seed')} on {short(name)}")
+            lines.append((short(name), *_cells(lost, by_method.get(FROM_SCRATCH))))
+    question = "Is a lost skill gone for good?"
+    if not lines:
+        return Section(question, ())
+    head = ("scenario", "lost skills", "steps to relearn", "never relearned", "steps without pretraining")
+    answer = f"Plain fine-tuning loses a skill in {', '.join(losses)}."
+    return Section(question, (answer,), (Table(head, tuple(lines)),), NOTES)
 
 
-def _never_again(lost: Sequence[Relearning]) -> str:
-    """Return the end of a sentence on steps to relearn, if some runs ended without the criterion."""
-    count = sum(not one.met for one in lost)
-    if not count:
-        return ""
-    return (
-        f"; in {count} of these {len(lost)} seeds it never does, which counts as the full budget of a stage"
-    )
+def _cells(lost: Sequence[Relearning], unpretrained: Row | None) -> tuple[str, str, str, str]:
+    """Return the cells on the skills that plain fine-tuning lost, and on a policy without pretraining."""
+    skills = {one.skill for one in lost}
+    same = [one for one, _ in _measured(unpretrained) if one.skill in skills]
+    never = f"{sum(not one.met for one in lost)} of {counted(len(lost), 'seed')}" if lost else MISSING
+    return (_skills(lost) or MISSING, _steps(lost), never, _with_skills(same))
 
 
 def _measured(row: Row | None) -> list[tuple[Relearning, float]]:
@@ -67,16 +62,8 @@ def _measured(row: Row | None) -> list[tuple[Relearning, float]]:
     ]
 
 
-def _without_pretraining(row: Row | None, lost: Sequence[Relearning]) -> str:
-    """Return what a policy without pretraining needs for the same skill; empty if no run measured that."""
-    found = [one for one, _ in _measured(row)]
-    same = [one for one in found if one.skill in {entry.skill for entry in lost}]
-    if len(same) < 2:
-        return ""
-    return (
-        f" A policy without pretraining, which has learned the targets, takes {_steps(same)} "
-        f"({_skills(same)})."
-    )
+def _with_skills(found: Sequence[Relearning]) -> str:
+    return f"{_steps(found)} ({_skills(found)})" if len(found) > 1 else MISSING
 
 
 def _skills(found: Sequence[Relearning]) -> str:
@@ -85,4 +72,7 @@ def _skills(found: Sequence[Relearning]) -> str:
 
 
 def _steps(found: Sequence[Relearning]) -> str:
+    """Return the mean number of steps; a dash for a single run, which has no interval."""
+    if len(found) < 2:
+        return MISSING
     return format_interval(mean_of_seeds([one.steps for one in found], (0.0, math.inf)), ".0f")

@@ -6,7 +6,7 @@ The same rows give the same bytes: no date, no absolute path, fixed digits.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -17,7 +17,7 @@ from clbench.scoring.metrics import METRICS, TITLES
 from clbench.scoring.scores import WEAK, WEAK_WARNING
 
 from ..board.agreement import Agreement, Concordance
-from ..board.frontier import TiedGain
+from ..board.frontier import TiedGain, side_of_zero
 from ..board.overall import OverallRow
 from ..board.predictors import predictions
 from ..board.rows import Row, standing_of
@@ -181,10 +181,11 @@ def agreement_text(found: Concordance | None) -> str:
 
 def concordance_text(found: Concordance) -> str:
     """Return Kendall's W with the probability of chance."""
-    return f"Kendall's W {found.w:.2f}, {_chance_text(found.chance)}"
+    return f"Kendall's W {found.w:.2f}, {chance_text(found.chance)}"
 
 
-def _chance_text(chance: float) -> str:
+def chance_text(chance: float) -> str:
+    """Return a p-value."""
     return f"p = {chance:.2g}" if chance >= 0.001 else "p < 0.001"
 
 
@@ -204,7 +205,7 @@ def prediction_text(rows: Iterable[Row]) -> str:
 def tau_text(found: Agreement) -> str:
     """Return Kendall's tau with its range over redrawn seeds and the probability of chance."""
     ends = " to ".join(number_text(end, ".2f") for end in (found.low, found.high))
-    return f"{number_text(found.tau, '.2f')}, {ends} with redrawn seeds, {_chance_text(found.chance)}"
+    return f"{number_text(found.tau, '.2f')}, {ends} with redrawn seeds, {chance_text(found.chance)}"
 
 
 def title_of(name: str) -> str:
@@ -298,24 +299,25 @@ def times_text(ratio: float) -> str:
     return number_text(ratio, ".2f") + "\N{MULTIPLICATION SIGN}"
 
 
-def over_tied(name: str, words: str, gain: Estimate, tied: Sequence[TiedGain]) -> Iterator[str]:
-    """Yield how a certain gain fares against settings of plain fine-tuning that tuning rated as highly.
+def gain_text(name: str, words: str, gain: Estimate, tied: Sequence[TiedGain]) -> str:
+    """Return a sentence on a gain that is told apart from 0: whether all its intervals are above 0.
 
-    `words` name the method, with the markup of the page.
+    Args:
+        name: Name of the scenario.
+        words: The method, with the markup of the page.
+        gain: Gain over plain fine-tuning at the setting that tuning chose.
+        tied: Gains over the settings that tuning rated as highly.
     """
-    chosen = format_interval(gain, ".3f")
+    doubt = "" if side_of_zero(gain, tied) == 1 else "not "
+    parts = [f"{format_interval(gain, '.3f')} over plain fine-tuning at the setting that tuning chose"]
     for one in tied:
-        sure, other = one.is_certain, format_interval(one.gain, ".3f")
-        over = (
-            f"{'and' if sure else 'but'} {other} at {rate_text(one.factor)}, which scored the same in tuning"
-        )
-        if not one.seeds:
-            over = f"but {no_tied_runs(one)}"
-        seeds = f" ({counted(one.seeds, 'seed')})" if one.seeds else ""
-        yield (
-            f"On {name}, the gain of {words} is {'certain' if sure else 'not certain'}: it is {chosen} over "
-            f"plain fine-tuning at the setting that tuning chose, {over}{seeds}."
-        )
+        at = no_tied_runs(one)
+        if one.seeds:
+            seeds = counted(one.seeds, "seed")
+            value = format_interval(one.gain, ".3f")
+            at = f"{value} at {rate_text(one.factor)}, which scored the same in tuning ({seeds})"
+        parts.append(f"{'and' if one.is_certain else 'but'} {at}")
+    return f"On {name}, the gain of {words} is {doubt}certain: it is {', '.join(parts)}."
 
 
 def no_tied_runs(tied: TiedGain) -> str:

@@ -19,8 +19,8 @@ from .format import (
     Column,
     agreement_text,
     column_title,
+    gain_text,
     machine_text,
-    over_tied,
     prediction_text,
     shown,
     start_text,
@@ -63,15 +63,13 @@ def markdown(board: Board, comparisons: Comparisons) -> str:
 
 
 def _tied_text(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]]) -> str:
-    """Return sentences on rows told apart above plain fine-tuning, but not certainly above tied settings."""
+    """Return sentences on rows told apart above plain fine-tuning, but not certainly above it."""
     sides = certain_sides(rows, tied)
-    found = [
-        sentence
+    return " ".join(
+        gain_text(name, row.method, row.estimates["gain"], tied.get(row.method, ()))
         for row in told_above(rows)
         if row.method not in sides
-        for sentence in over_tied(name, row.method, row.estimates["gain"], tied[row.method])
-    ]
-    return " ".join(found)
+    )
 
 
 def _all_shown(tables: Iterable[Sequence[Row]]) -> list[Column]:

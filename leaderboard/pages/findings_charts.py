@@ -1,12 +1,13 @@
-"""The picture of the findings: the gain of every method over tuned fine-tuning, with its interval."""
+"""The pictures of the findings: gains over tuned fine-tuning, and what smaller learning rates keep."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from ..board.frontier import Curve
 from ..board.rows import Row
 from ..board.summary import DIVISIONS
-from ..views.page.charts.vega import FONT, Spec, axis, colour, heading, layer, rounded, specification
+from ..views.page.charts.vega import FONT, SHAPES, Spec, axis, colour, heading, layer, rounded, specification
 
 WIDTH = 520
 """Width of the plot in pixels."""
@@ -24,7 +25,13 @@ def gains_chart(boards: Mapping[str, Sequence[Row]]) -> Spec:
     return specification(FONT, padding=PADDING, vconcat=panels)
 
 
+def rates_chart(ladders: Mapping[str, Sequence[Curve]]) -> Spec:
+    """Return the chart: one panel for each scenario, one line for each method, one point for each rate."""
+    return specification(FONT, padding=PADDING, vconcat=[_rates(*ladder) for ladder in ladders.items()])
+
+
 def _panel(name: str, rows: Sequence[Row]) -> Spec:
+    """Return the panel of the gains on a scenario."""
     values = [
         {
             "method": row.method,
@@ -69,4 +76,38 @@ def _panel(name: str, rows: Sequence[Row]) -> Spec:
                 "encoding": {"y": method, "x": gain, "color": hue},
             },
         ],
+    }
+
+
+def _rates(name: str, curves: Sequence[Curve]) -> Spec:
+    """Return the panel of what the methods keep at the learning rates of a scenario."""
+    values = [
+        {"method": curve.method, "rate": f"{one.factor:g}", "kept": rounded(one.kept.value)}
+        for curve in curves
+        for one in curve.rungs
+    ]
+    factors = sorted({one.factor for curve in curves for one in curve.rungs}, reverse=True)
+    rates = [f"{factor:g}" for factor in factors]
+    method = {
+        "field": "method",
+        "type": "nominal",
+        "sort": [curve.method for curve in curves],
+        "title": None,
+        "axis": {"labelColor": colour("ink")},
+    }
+    scale = {"domain": rates, "range": [colour(f"mark-{place % 6}") for place in range(len(rates))]}
+    marks = {"domain": rates, "range": [SHAPES[place % 6] for place in range(len(rates))]}
+    legend = {"title": "learning rate, times the scenario's", "titleColor": colour("ink")}
+    return {
+        "title": heading(name),
+        "width": WIDTH,
+        "height": ROW_HEIGHT * len(curves),
+        "data": {"values": values},
+        "mark": {"type": "point", "filled": True, "size": 70, "opacity": 1},
+        "encoding": {
+            "y": method,
+            "x": axis("kept", "kept, mean over seeds"),
+            "color": {"field": "rate", "type": "nominal", "legend": legend, "scale": scale},
+            "shape": {"field": "rate", "type": "nominal", "legend": legend, "scale": marks},
+        },
     }
