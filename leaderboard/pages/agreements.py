@@ -16,11 +16,11 @@ from ..board.agreement import (
     SIGNIFICANCE,
     Agreement,
     Concordance,
+    RankCorrelation,
     agreement_between,
     kendall_tau,
 )
-from ..board.predictors import predictions
-from ..board.rows import Board, Row, agreement, values_by_seed
+from ..board.rows import Board, Row, agreement, predictions, values_by_seed
 from ..board.summary import RANKED_BY, WITHOUT_DEMONSTRATIONS
 from ..views.format import MISSING, chance_text, number_text, title_of
 from ..views.sections import Section, Table, short
@@ -136,7 +136,7 @@ BY_CONSTRUCTION = "`stop_gradient` does not train the backbone, so by constructi
 
 def predictors_section(boards: Mapping[str, list[Row]]) -> Section:
     """Return what orders the methods as their forgetting does."""
-    by_place: dict[tuple[str, str], list[Agreement | None]] = {}
+    by_place: dict[tuple[str, str], list[RankCorrelation | None]] = {}
     for name, rows in boards.items():
         every, rest = (
             {one.predictor: one for one in predictions(them)} for them in (rows, without_demonstrations(rows))
@@ -155,7 +155,7 @@ def predictors_section(boards: Mapping[str, list[Row]]) -> Section:
     return Section(question, tuple(answers), (Table(head, lines),), notes)
 
 
-def _that_predict(by_place: Mapping[tuple[str, str], Sequence[Agreement | None]]) -> Iterator[str]:
+def _that_predict(by_place: Mapping[tuple[str, str], Sequence[RankCorrelation | None]]) -> Iterator[str]:
     """Yield the predictors whose order is certain after the correction."""
     groups = ("", " without prior demonstrations")
     found = [
@@ -199,18 +199,18 @@ def after_correction(chances: Sequence[float], which: str) -> Iterator[str]:
     )
 
 
-def _chances(found: Iterable[Agreement | None]) -> list[float]:
+def _chances(found: Iterable[RankCorrelation | None]) -> list[float]:
     return [one.chance for one in found if one is not None]
 
 
-def _columns(found: Sequence[Agreement | None]) -> tuple[list[str], list[str]]:
+def _columns(found: Sequence[RankCorrelation | None]) -> tuple[list[str], list[str]]:
     """Return the cells of agreements, which alternate: with all methods, and with some of them."""
     corrected = iter(holm(_chances(found)))
     cells = [MISSING if one is None else _tau_text(one, next(corrected)) for one in found]
     return cells[::2], cells[1::2]
 
 
-def _tau_text(found: Agreement, corrected: float) -> str:
+def _tau_text(found: RankCorrelation, corrected: float) -> str:
     """Return the cell of an agreement, given its p-value after the correction."""
     order = {1: "agree: ", 0: "", -1: "opposite: "}[found.direction]
     alone = " (only before Holm's correction)" if found.direction and corrected >= SIGNIFICANCE else ""

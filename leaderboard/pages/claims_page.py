@@ -110,8 +110,9 @@ def _verdict_line(claim: Claim, judged: Sequence[Judged], boards: Sequence[str])
 
 
 def _verdict_cell(one: Judged, what: str) -> str:
-    """Return a verdict with the value of its first figure, if that is the figure `what`."""
-    shown = [figure for figure in one.finding.figures[:1] if figure.what == what]
+    """Return a verdict with the value of its first figure, if that is the figure `what` and has a value."""
+    first = one.finding.figures[:1]
+    shown = [figure for figure in first if figure.what == what and figure.estimate.value is not None]
     return ": ".join([one.finding.verdict, *map(figure_text, shown)])
 
 

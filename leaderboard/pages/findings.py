@@ -14,7 +14,8 @@ from clbench.scoring.intervals import Estimate
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.references import BASELINE, FROZEN
 
-from ..board.rows import Board, Row, certain_sides
+from ..board.certainty import sides_of_gains
+from ..board.rows import Board, Row
 from ..board.summary import WITH_DEMONSTRATIONS, WITHOUT_DEMONSTRATIONS, grouped, tables_of
 from ..claims.claim import DECIDED, PREDICATES
 from ..claims.evidence import Evidence
@@ -75,7 +76,7 @@ def in_short(board: Board, judged: Sequence[Judged]) -> list[str]:
     """Return the answers that most readers look for; `sections` have their figures and limits."""
     above: dict[str, list[Row]] = {}
     for name, rows in _boards(board).items():
-        sides = certain_sides(rows, board.tied.get(name, {}))
+        sides = sides_of_gains(rows, board.tied.get(name, {}))
         if others := by_gain(rows):
             above[name] = [row for row in others if sides.get(row.method) == 1]
     divisions = {"Without": WITHOUT_DEMONSTRATIONS, "With": WITH_DEMONSTRATIONS}

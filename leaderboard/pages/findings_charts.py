@@ -22,7 +22,8 @@ ROW_HEIGHT = 18
 def gains_chart(boards: Mapping[str, Sequence[Row]]) -> Spec:
     """Return the chart: one panel for each scenario, one line for each method, the largest gain on top."""
     panels = [_panel(name, rows) for name, rows in boards.items() if rows]
-    return specification(FONT, padding=PADDING, vconcat=panels)
+    same_axis = {"scale": {"x": "shared"}}
+    return specification(FONT, padding=PADDING, vconcat=panels, resolve=same_axis)
 
 
 def rates_chart(ladders: Mapping[str, Sequence[Curve]]) -> Spec:

@@ -10,8 +10,8 @@ from clbench.scoring.groups import differences_needed
 from clbench.scoring.intervals import Estimate
 from clbench.spec.references import BASELINE
 
-from ..board.frontier import TiedGain, side_of_zero
-from ..board.rows import Row, apart_from_baseline, certain_sides, told_above
+from ..board.certainty import TiedGain, side_of_zero, sides_of_gains
+from ..board.rows import Row
 from ..board.summary import RANKED_BY, WITHOUT_DEMONSTRATIONS, competing
 from ..views.format import MISSING, format_interval, gain_text, number_text, rate_text
 from ..views.sections import Section, Table, short
@@ -71,8 +71,9 @@ def _without_demonstrations(rows: Sequence[Row]) -> list[Row]:
 def _certain_gains(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]]) -> Iterator[str]:
     """Yield the gains that are told apart from 0: first those that are certain, then the others."""
     gains = {row.method: row.estimates["gain"] for row in _without_demonstrations(rows)}
-    better = [row.method for row in told_above(rows) if row.method in gains]
-    sides = certain_sides(rows, tied)
+    sides = sides_of_gains(rows, tied)
+    better = [row.method for row in rows if row.method in gains and row.method in sides]
+    better = [method for method in better if (gains[method].value or 0.0) > 0]
     certain = [method for method in better if sides.get(method) == 1]
     if certain:
         named = ", ".join(f"`{method}` by {format_interval(gains[method], '.3f')}" for method in certain)
@@ -88,7 +89,7 @@ def _gain_line(
     """Return the cells of a scenario."""
     others = _without_demonstrations(rows)
     gains = {row.method: row.estimates["gain"] for row in others}
-    apart = apart_from_baseline(rows)
+    apart = sides_of_gains(rows, tied)
     best = next(iter(gains))
     told = [
         f"{_named(method, gains[method])}{_unlearned(others, method)}" for method in gains if method in apart
@@ -171,10 +172,10 @@ def replay_section(boards: Mapping[str, Sequence[Row]], tied: Tied) -> Section:
     lines: list[tuple[str, ...]] = []
     certain: list[bool] = []
     for name, rows in boards.items():
-        sides = certain_sides(rows, tied.get(name, {}))
+        sides = sides_of_gains(rows, tied.get(name, {}))
         members = [row for row in by_gain(rows) if _keeps_data(row)]
         certain += [sides.get(row.method) == 1 for row in members]
-        lines += [_replay_line(row, "" if row.method in sides else " (not certain)") for row in members]
+        lines += [_replay_line(row, "" if sides.get(row.method) else " (not certain)") for row in members]
         lines += [_replay_line(row) for row in rows if row.method == BASELINE and members]
     question = "What do prior demonstrations buy?"
     if not lines:

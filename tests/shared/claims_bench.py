@@ -147,9 +147,11 @@ def _a_check_later(took: tuple[int, int]) -> tuple[int, int]:
 
 
 def verdicts(page: str) -> dict[str, str]:
-    """Return the verdicts in the table at the top."""
+    """Return the verdicts in the table at the top, on its first scenario and without their figures."""
     return {
-        line.split("]")[0][3:]: line.split(" | ")[3] for line in page.splitlines() if line.startswith("| [")
+        line.split("]")[0][3:]: re.split(r":| \|", line.split(" | ", 3)[3])[0]
+        for line in page.splitlines()
+        if line.startswith("| [")
     }
 
 
