@@ -12,7 +12,7 @@ from result_files import read_results
 from clbench.base.entry_points import resolve
 
 DOCS = Path(__file__).parents[1] / "docs" / "reference"
-VEGA_LITE = resolve("clbench.leaderboard.views.page.charts.picture:VEGA_LITE")
+VEGA_LITE = resolve("clbench.leaderboard.views.charts.picture:VEGA_LITE")
 
 INTRODUCTION = """\
 # Performance

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 from rich.console import Console
 
 from clbench.base.entry_points import unknown
-from clbench.base.errors import InputError, UnknownNameError
+from clbench.base.errors import InputError
 from clbench.base.text import counted, print_plain, printable
 from clbench.cli.arguments import (
     AsJson,
@@ -31,10 +31,10 @@ from clbench.cli.arguments import (
 from clbench.jobs.folders import check_folders
 from clbench.records.paths import RECORDS, record_path
 from clbench.records.reader import RecordError, check_home, read_record
-from clbench.spec.identifiers import scenario_ids, without_module
+from clbench.spec.identifiers import folder_name, scenario_ids, without_module
 from clbench.spec.protocol import DEFAULT_SEEDS
 
-from .board.paths import SCENARIO
+from .board.paths import LADDER, SCENARIO
 
 if TYPE_CHECKING:
     from .board.rows import Board
@@ -65,11 +65,11 @@ def show(
         published: First copy published records that the folder lacks, so that the table shows your rows
             together with the published ones.
         as_json: Print a JSON list with an object for each row, with every metric and cost, and write no
-            files. Standard error says which records are not shown.
+            files. Standard error says which records are not shown, and why.
     """
     from clbench.scoring.metrics import load_metric
 
-    from .board.summary import column_names, values_of
+    from .board.summary import column_names, in_order_of, values_of
     from .publishing import add_published, inputs_of, read_unchanged, site_of, write_site
     from .views.files import print_written
     from .views.terminal import terminal
@@ -92,12 +92,13 @@ def show(
     computed = None
     if board is None:
         board = computed = _computed(records)
-    if not board.rows:
-        _print_not_shown(board, messages)
-        messages.print(error_line(f"No record in {records} makes a row, so no board was written."))
+    shown = board if scenario is None or not board.rows else _of_scenario(board, without_module(scenario))
+    if not shown.rows:
+        _print_not_shown(shown, messages)
+        messages.print(error_line(_why_empty(board, shown, scenario, records)))
         raise SystemExit(2)
-    with checked_input():
-        shown = _chosen(board, scenario, records)
+    if sort is not None:
+        shown = replace(shown, rows=in_order_of(shown.rows, sort))
     if as_json:
         print_json([dict(zip(column_names(), values_of(row), strict=True)) for row in shown.rows])
         _print_not_shown(shown, messages)
@@ -125,24 +126,25 @@ def _computed(records: Path) -> Board:
         return compute_board(records)
 
 
-def _chosen(board: Summary, scenario: str | None, records: Path) -> Summary:
-    """Return the part of the board that is asked for.
-
-    Raises:
-        UnknownNameError: The board has no rows of the scenario.
-    """
-    if scenario is None:
-        return board
-    scenario = without_module(scenario)
+def _of_scenario(board: Summary, scenario: str) -> Summary:
+    """Return the part of the board in the folders of a scenario: its rows, and its files that make none."""
     rows = tuple(row for row in board.rows if row.scenario == scenario)
-    if not rows and scenario in scenario_ids():
-        raise UnknownNameError(
-            f"No record in {records} makes a row of {scenario}: `clbench run {scenario} sft` makes some. "
-            f"Scenarios with rows: {', '.join(sorted(board.starts))}."
-        )
-    if not rows:
-        raise unknown("scenario with records", scenario, board.starts)
-    return replace(board, rows=rows, not_shown=())
+    folders = tuple(f"{parent}{folder_name(scenario)}/" for parent in ("", f"{LADDER.name}/"))
+    not_shown = tuple(entry for entry in board.not_shown if entry.path.startswith(folders))
+    return replace(board, rows=rows, not_shown=not_shown)
+
+
+def _why_empty(board: Summary, shown: Summary, scenario: str | None, records: Path) -> str:
+    """Return why `shown`, the part of the board for a scenario, has no rows, and what makes some."""
+    if scenario is None or not board.rows:
+        return f"No record in {records} makes a row, so no board was written."
+    scenario = without_module(scenario)
+    if not shown.not_shown and scenario not in scenario_ids():
+        return str(unknown("scenario with records", scenario, board.starts).args[0])
+    # `clbench run` skips runs that have a record
+    advice = "" if shown.not_shown else f": `clbench run {scenario} sft` makes some"
+    names = ", ".join(sorted(board.starts))
+    return f"No record in {records} makes a row of {scenario}{advice}. Scenarios with rows: {names}."
 
 
 def submit(

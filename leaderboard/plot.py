@@ -17,7 +17,7 @@ from clbench.records.paths import RECORDS
 if TYPE_CHECKING:
     from clbench.records.record import Record
 
-    from .views.page.charts.picture import Plot
+    from .views.charts.picture import Plot
 
 __all__ = ["curves", "frontier", "matrix", "plane"]
 
@@ -38,8 +38,8 @@ def matrix(runs: Record | Iterable[Record] | Path | str, *, dark: bool = False) 
         InputError: There is no record, or the records are of several methods or of different scenarios.
         RecordError: A file is not a record, or its run failed.
     """
-    from .views.page.charts.picture import themed
-    from .views.page.runs import Runs, matrix_of
+    from .views.charts.picture import themed
+    from .views.charts.runs import Runs, matrix_of
 
     return themed(matrix_of(Runs.of(_records(runs))), dark)
 
@@ -62,8 +62,8 @@ def curves(
             `sft` has runs of another method.
         RecordError: A file is not a record, or its run failed.
     """
-    from .views.page.charts.picture import themed
-    from .views.page.runs import Runs, curves_of
+    from .views.charts.picture import themed
+    from .views.charts.runs import Runs, curves_of
 
     beside = None if sft is None else Runs.of(_records(sft))
     return themed(curves_of(Runs.of(_records(runs)), beside), dark)
@@ -85,9 +85,9 @@ def plane(records: Path | str = RECORDS, scenario: str | None = None, *, dark: b
         UnknownNameError: The scenario has no row.
     """
     from .publishing import read_board
-    from .views.page.charts.picture import themed
-    from .views.page.charts.plane import WIDE
-    from .views.page.charts.plane import plane as chart
+    from .views.charts.picture import themed
+    from .views.charts.plane import WIDE
+    from .views.charts.plane import plane as chart
 
     rows = read_board(Path(records)).rows
     names = [row.scenario for row in rows]
@@ -101,7 +101,8 @@ def plane(records: Path | str = RECORDS, scenario: str | None = None, *, dark: b
 def frontier(records: Path | str = RECORDS, scenario: str | None = None, *, dark: bool = False) -> Plot:
     """Return a chart of what the methods of a scenario learn and keep at each learning rate of the ladder.
 
-    The records of the ladder are in the folder `ladder` next to the folder of the records.
+    The records of the ladder are in the folder `ladder` next to the folder of the records. Those that cannot
+    be compared with the rows of the board are left out.
 
     Args:
         records: Folder of the records.
@@ -113,10 +114,11 @@ def frontier(records: Path | str = RECORDS, scenario: str | None = None, *, dark
         UnknownNameError: The scenario has none.
     """
     from .board.frontier import frontiers_of, ladder_of, read_ladder
-    from .views.page.charts.frontier import WIDE
-    from .views.page.charts.frontier import frontier as chart
-    from .views.page.charts.picture import themed
-    from .views.page.charts.vega import FONT, heading
+    from .board.rows import runs_of_rows
+    from .views.charts.frontier import WIDE
+    from .views.charts.frontier import frontier as chart
+    from .views.charts.picture import themed
+    from .views.charts.vega import FONT, heading
 
     folder = ladder_of(Path(records))
     if not folder.is_dir():
@@ -124,7 +126,8 @@ def frontier(records: Path | str = RECORDS, scenario: str | None = None, *, dark
             f"There is no ladder at {folder}. `make ladder` runs it in a clone, or: clbench run SCENARIO "
             f"METHODS --set.step_factor 0.3 --records {folder}"
         )
-    found = frontiers_of(read_ladder(folder)[0])
+    board, _ = runs_of_rows(Path(records))
+    found = frontiers_of(read_ladder(folder, board)[0])
     chosen = _chosen(scenario, {name: len(curves) for name, curves in found.items()}, "curve", folder)
     return themed({**chart(found[chosen], WIDE, FONT), "title": heading(chosen)}, dark)
 

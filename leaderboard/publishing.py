@@ -37,6 +37,9 @@ PUBLISHED = Path(__file__).parent / "records"
 NUMBERS = "board.json"
 """Name of the file with the numbers of the board."""
 
+MOST_OF_A_SITE = 2**30
+"""Most bytes of a file of the site: the page of many records is larger than what a stranger's file may be."""
+
 _CODE = (
     *("clbench.base", "clbench.spec", "clbench.records", "clbench.runs", "clbench.scoring"),
     *("clbench.learning", "clbench.metrics", "clbench.leaderboard.board", "clbench.leaderboard.policies"),
@@ -108,8 +111,8 @@ def read_unchanged(records: Path, inputs: dict[str, str]) -> Summary | None:
     """Return the numbers of the board, None unless every file of the site is whole and made from `inputs`."""
     site = site_of(records)
     try:
-        kept: dict[str, Any] = json.loads(_read_own(site / NUMBERS))
-        files = {name: _hash_of_bytes(_read_own(site / name)) for name in kept["files"]}
+        kept: dict[str, Any] = json.loads(read_regular(site / NUMBERS, MOST_OF_A_SITE))
+        files = {name: _hash_of_bytes(read_regular(site / name, MOST_OF_A_SITE)) for name in kept["files"]}
         whole = kept["files"] == files and kept["content"] == content_hash(kept)
         return Summary.from_json(kept["board"]) if whole and kept["made_from"] == inputs else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):  # none yet, or damaged
@@ -156,17 +159,10 @@ def write_site(board: Board, records: Path, inputs: dict[str, str]) -> dict[Path
 def _files_of(site: Path) -> set[str]:
     """Return the names of the files that the board of a folder was written to; empty if that is unknown."""
     try:
-        names = json.loads(_read_own(site / NUMBERS))["files"]
+        names = json.loads(read_regular(site / NUMBERS, MOST_OF_A_SITE))["files"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return set()
     return {name for name in names if isinstance(name, str) and Path(name).name == name}
-
-
-def _read_own(path: Path) -> bytes:
-    """Return the content of a regular file of the site. The page may be larger than `read_regular` allows."""
-    if path.is_symlink() or not path.is_file():
-        raise OSError(f"{path} is no regular file")
-    return path.read_bytes()
 
 
 def _hash_of_bytes(content: bytes) -> str:

@@ -68,7 +68,8 @@ def from_matrix(
         matrix: Success rates, (stages, tasks) or (seeds, stages, tasks), NaN where missing; or several such
             arrays by the name of the method. Row k is the end of stage k, in which target k is learned. If
             there is one row more than targets, the first row is stage 0, before the first target. The metric
-            gain compares with a method called sft, and intransigence with one called joint.
+            gain compares each seed with the same one of a method called sft, and intransigence with that of
+            one called joint.
         tasks: Names of the columns, by default "task 1", "task 2" and so on.
         retained: Names of the tasks that are known before the first target and never trained again; a
             single string is one name, here and below.
@@ -79,14 +80,11 @@ def from_matrix(
             shares unless one is above 1; `Report.unit` says what was assumed.
 
     Raises:
-        InputError: A shape does not fit the tasks or the other methods, a rate is not a number or is out of
-            range, there is no such unit, or the rates leave the unit in doubt.
+        InputError: A shape does not fit the tasks or the other methods, two methods have one name, a rate is
+            not a number or is out of range, there is no such unit, or the rates leave the unit in doubt.
         UnknownNameError: There is no such task.
     """
-    given = matrix if isinstance(matrix, Mapping) else {"": matrix}
-    arrays = {str(method): _array(values, str(method)) for method, values in given.items()}
-    if not arrays:
-        raise InputError("There is no matrix: expected at least one method.")
+    arrays = _arrays(matrix if isinstance(matrix, Mapping) else {"": matrix})
     rows, columns = _shape(arrays)
     names = _names(tasks) if tasks is not None else tuple(f"task {n}" for n in range(1, columns + 1))
     if len(names) != columns:
@@ -95,18 +93,44 @@ def from_matrix(
     first = 1 + len(layout.target) - rows
     if first not in (0, 1):
         raise InputError(f"The matrix has {counted(rows, 'row')}. {_expected_stages(layout)}")
+    several = any(array.ndim == 3 and len(array) > 1 for array in arrays.values())
     cells = {
-        Cell(method, str(seed) if len(array) > 1 else "", first + row, name): float(array[seed, row, column])
+        Cell(method, seed, first + row, name): float(values[row, column])
         for method, array in arrays.items()
-        for seed in range(len(array))
+        for seed, values in _by_seed(array, several).items()
         for row in range(rows)
         for column, name in enumerate(names)
     }
     return measure(matrices_of(cells, layout, unit))
 
 
+def _arrays(given: Mapping[str, ArrayLike]) -> dict[str, Array]:
+    """Return success rates as arrays, (stages, tasks) or (seeds, stages, tasks), by name of the method."""
+    if not given:
+        raise InputError("There is no matrix: expected at least one method.")
+    arrays: dict[str, Array] = {}
+    for method, values in given.items():
+        name = str(method)  # a key may be a number
+        if name in arrays:
+            raise InputError(f"Two methods are called {quoted(name)}: rename one.")
+        arrays[name] = _array(values, name)
+    return arrays
+
+
+def _by_seed(array: Array, several: bool) -> dict[str, Array]:
+    """Return the matrices of an array by seed, by its position; the empty name stands for no seed.
+
+    Args:
+        array: Success rates, (stages, tasks) or (seeds, stages, tasks).
+        several: Whether a method has several seeds; if none has, seeds need no names.
+    """
+    if array.ndim == 2:
+        return {"": array}
+    return {str(seed) if several else "": matrix for seed, matrix in enumerate(array)}
+
+
 def _array(values: ArrayLike, method: str) -> Array:
-    """Return success rates as an array, (seeds, stages, tasks)."""
+    """Return the success rates of a method as an array, (stages, tasks) or (seeds, stages, tasks)."""
     name = f" of method {quoted(method)}" if method else ""
     try:
         array = np.asarray(values, dtype=np.float64)
@@ -120,12 +144,12 @@ def _array(values: ArrayLike, method: str) -> Array:
             f"The matrix{name} has the shape {array.shape}: expected (stages, tasks) or (seeds, stages, "
             "tasks)."
         )
-    return array if array.ndim == 3 else array[None]
+    return array
 
 
 def _shape(arrays: Mapping[str, Array]) -> tuple[int, int]:
     """Return the number of rows and columns, the same for all methods."""
-    shapes = {method: array.shape[1:] for method, array in arrays.items()}
+    shapes = {method: array.shape[-2:] for method, array in arrays.items()}
     (rows, columns), *others = set(shapes.values())
     if others:
         found = ", ".join(f"{quoted(method)} {shape}" for method, shape in shapes.items())

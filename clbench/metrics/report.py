@@ -24,7 +24,7 @@ from clbench.scoring.intervals import interval
 from clbench.scoring.layout import Array, Layout
 from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import METRICS, load_metric
-from clbench.scoring.rates import Rates
+from clbench.scoring.rates import Rates, leave_one_out
 
 if TYPE_CHECKING:
     import pandas
@@ -162,12 +162,8 @@ def _value(metric: Metric, method: str, matrices: Matrices) -> Value:
     value = float(metric.over_runs(rates))
     if not math.isfinite(value):
         return Value(None, reason=_reason(metric, method, matrices))
-    # the values without each seed in turn; none if there is one seed
-    others = [
-        float(metric.over_runs(rates.each(functools.partial(np.delete, obj=place, axis=0))))
-        for place in range(len(runs) if len(runs) > 1 else 0)
-    ]
-    found = interval(value, np.array(others), span=(metric.low, metric.high))
+    others = metric.over_runs(leave_one_out(rates)) if len(runs) > 1 else np.zeros(0)
+    found = interval(value, others, span=(metric.low, metric.high), ratio=metric.ratio)
     return Value(value, found.low, found.high)
 
 

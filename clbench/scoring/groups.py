@@ -298,7 +298,6 @@ def _measured(metric: Metric, runs: Runs, seeds: Sequence[int]) -> tuple[float, 
     of_seeds = np.full(len(seeds), np.nan)
     without_episode = np.full((len(seeds), episodes), np.nan)
     for seed in own:
-        rates = runs[seed].rates(counts)
-        without_episode[seeds.index(seed)] = metric.over_runs(rates.each(lambda array: array[:, None]))
-    of_seeds[[seeds.index(seed) for seed in own]] = metric.over_runs(whole.each(lambda array: array[:, None]))
+        without_episode[seeds.index(seed)] = metric.function(runs[seed].rates(counts))
+    of_seeds[[seeds.index(seed) for seed in own]] = metric.function(whole)
     return float(metric.over_runs(whole)), of_seeds, without_episode

@@ -41,7 +41,7 @@ from clbench.base.errors import InputError
 from clbench.scoring.layout import Array
 from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import load_metric
-from clbench.scoring.rates import Rates, check_same, stacked
+from clbench.scoring.rates import Rates, check_same, leave_one_out, stacked
 from clbench.scoring.scores import Scores, rates_of
 
 Runs = Mapping[int, Scores]
@@ -50,6 +50,9 @@ Runs = Mapping[int, Scores]
 Span = tuple[float, float]
 """The least and the greatest value that a quantity can have; they may be infinite."""
 UNBOUNDED: Span = (-math.inf, math.inf)
+
+Quantity = Callable[[Mapping[str, Rates]], Array]
+"""Maps the rates of each method, with batch axes (..., runs), to values (...)."""
 
 REPLICATES = 2000
 """Draws behind an interval of episodes."""
@@ -92,6 +95,12 @@ class Estimate:
         """Return whether the interval describes other seeds and is below `bar`."""
         return self.of_seeds and self.high is not None and self.high < bar
 
+    def transformed(self, increasing: Callable[[float], float]) -> Estimate:
+        """Return the estimate of an increasing function of the quantity."""
+        ends = (self.value, self.low, self.high)
+        value, low, high = (None if end is None else increasing(end) for end in ends)
+        return Estimate(value, low, high, self.of_seeds)
+
 
 NO_ESTIMATE = Estimate(None, None, None)
 """The estimate of a value that cannot be computed."""
@@ -129,20 +138,14 @@ def estimate(
     if not runs:
         return {metric.name: NO_ESTIMATE for metric in wanted}
     seeds = sorted(runs)
-    methods = [[runs[seed] for seed in seeds]]
+    methods = {"": [runs[seed] for seed in seeds]}
     # Metrics with the same references share their draws; most have none, and draws of episodes cost most.
     samples = {
         names: _Samples(methods, needed_references([one], seeds, references), generator, replicates)
         for names, one in {one.references: one for one in wanted}.items()
     }
 
-    def over_runs(metric: Metric) -> _Quantity:
-        return lambda rates: metric.over_runs(rates[0])
-
-    return {
-        one.name: samples[one.references].estimate(over_runs(one), (one.low, one.high), ratio=one.ratio)
-        for one in wanted
-    }
+    return {one.name: samples[one.references].estimate_metric(one) for one in wanted}
 
 
 def paired_difference(
@@ -175,7 +178,7 @@ def paired_difference(
     if not seeds:
         return NO_ESTIMATE
     reach = wanted.high - wanted.low
-    return bootstrap(
+    return estimate_quantity(
         lambda of: wanted.over_runs(of["one"]) - wanted.over_runs(of["other"]),
         {"one": [runs[seed] for seed in seeds], "other": [others[seed] for seed in seeds]},
         generator,
@@ -184,8 +187,8 @@ def paired_difference(
     )
 
 
-def bootstrap(
-    quantity: Callable[[Mapping[str, Rates]], Array],
+def estimate_quantity(
+    quantity: Quantity,
     runs: Mapping[str, Sequence[Scores]],
     generator: np.random.Generator,
     *,
@@ -207,8 +210,7 @@ def bootstrap(
         InputError: A method has no run or another number of runs than the others, or the runs are of
             different tasks, episodes, evaluation points or questions.
     """
-    samples = _Samples(list(runs.values()), {}, generator, replicates)
-    return samples.estimate(lambda rates: quantity(dict(zip(runs, rates, strict=True))), span, ratio=ratio)
+    return _Samples(runs, {}, generator, replicates).estimate(quantity, span, ratio=ratio)
 
 
 def interval(
@@ -235,8 +237,7 @@ def interval(
         found = interval(
             math.log(value), np.log(without_one), other_episodes and (lambda: np.log(other_episodes()))
         )
-        low, high = (None if end is None else math.exp(end) for end in (found.low, found.high))
-        return Estimate(value, low, high, found.of_seeds)
+        return replace(found.transformed(math.exp), value=value)
     if not math.isfinite(value):
         return NO_ESTIMATE
     # A metric that has no value without one of the seeds, or with other episodes, has no honest interval.
@@ -257,10 +258,17 @@ def interval(
     return Estimate(value, min(float(low), value), max(float(high), value), of_seeds=degrees > 0)
 
 
-def mean_of_seeds(values: Sequence[float], span: Span, *, ratio: bool = False) -> Estimate:
-    """Return the mean of one or more values, one for each seed, with its interval; none with one seed.
+def mean_of_seeds(
+    values: Sequence[float],
+    span: Span,
+    other_episodes: Callable[[], Array] | None = None,
+    *,
+    ratio: bool = False,
+) -> Estimate:
+    """Return the mean of one or more values, one for each seed, with its interval.
 
-    `ratio` is as for `interval`; with it, the mean is geometric.
+    The other arguments are as for `interval`: without `other_episodes`, one seed has no interval, and with
+    `ratio`, the mean is geometric.
     """
     geometric = ratio and min(values) > 0
 
@@ -270,7 +278,8 @@ def mean_of_seeds(values: Sequence[float], span: Span, *, ratio: bool = False) -
         return math.fsum(some) / len(some)
 
     rest = [[*values[:place], *values[place + 1 :]] for place in range(len(values))]
-    return interval(mean(values), np.array([mean(part) for part in rest if part]), span=span, ratio=geometric)
+    others = np.array([mean(part) for part in rest if part])
+    return interval(mean(values), others, other_episodes, span, ratio=geometric)
 
 
 def interval_of_seeds(value: float, error: float, degrees: int, span: Span) -> Span:
@@ -336,16 +345,13 @@ def draw_episodes(shape: tuple[int, ...], episodes: int, generator: np.random.Ge
 
 # ---- rates of the runs, and their replicates ---------------------------------------------------------------
 
-_Quantity = Callable[[Sequence[Rates]], Array]
-"""Maps the rates of each method, with batch axes (..., runs), to values (...)."""
-
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
     """Runs of several methods with the same seeds, and the replicates drawn from them."""
 
-    methods: Sequence[Sequence[Scores]]
-    """Runs of each method, in the order of the seeds."""
+    methods: Mapping[str, Sequence[Scores]]
+    """Runs of each method by its name, in the order of the seeds."""
     references: Mapping[str, Sequence[Scores]]
     """Runs of reference methods, in the same order."""
     generator: np.random.Generator
@@ -354,44 +360,53 @@ class _Samples:
     """Number of draws."""
 
     def __post_init__(self) -> None:
-        every = (*self.methods, *self.references.values())
-        if len({len(runs) for runs in every}) != 1 or not self.methods[0]:
+        every = (*self.methods.values(), *self.references.values())
+        if {len(runs) for runs in every} != {self.count} or not self.count:
             raise InputError(
                 "All methods need runs of the same seeds, in the same order, and at least one run."
             )
         check_same(run.layout for runs in every for run in runs)
 
-    def estimate(self, quantity: _Quantity, span: Span, *, ratio: bool = False) -> Estimate:
+    @property
+    def count(self) -> int:
+        """Number of seeds."""
+        return len(next(iter(self.methods.values()), ()))
+
+    def estimate(self, quantity: Quantity, span: Span, *, ratio: bool = False) -> Estimate:
         """Return a quantity with its interval; `ratio` is as for `interval`."""
         return interval(
             float(quantity(self.whole)),
-            quantity(self.without_one) if len(self.methods[0]) > 1 else np.zeros(0),
+            quantity(self.without_one) if self.count > 1 else np.zeros(0),
             lambda: quantity(self.other_episodes),
             span,
             ratio=ratio,
         )
 
+    def estimate_metric(self, metric: Metric) -> Estimate:
+        """Return a metric of the only method with its interval."""
+        (name,) = self.methods
+        span = (metric.low, metric.high)
+        return self.estimate(lambda rates: metric.over_runs(rates[name]), span, ratio=metric.ratio)
+
     @cached_property
-    def whole(self) -> list[Rates]:
+    def whole(self) -> dict[str, Rates]:
         """The runs as they are, (runs,)."""
-        return [rates_of(runs, self.references) for runs in self.methods]
+        return {name: rates_of(runs, self.references) for name, runs in self.methods.items()}
 
     @cached_property
-    def without_one(self) -> list[Rates]:
+    def without_one(self) -> dict[str, Rates]:
         """All runs but one, for each one, (runs, runs - 1)."""
-        numbers = np.arange(len(self.methods[0]))
-        others = np.array([np.delete(numbers, one) for one in numbers])
-        return [rates.each(lambda array: array[others]) for rates in self.whole]
+        return {name: leave_one_out(rates) for name, rates in self.whole.items()}
 
     @cached_property
-    def other_episodes(self) -> list[Rates]:
+    def other_episodes(self) -> dict[str, Rates]:
         """The runs with episodes and answers drawn anew, (replicates, runs)."""
-        layout = self.methods[0][0].layout
-        shape = (self.replicates, len(self.methods[0]), len(layout.tasks))
+        layout = next(iter(self.methods.values()))[0].layout
+        shape = (self.replicates, self.count, len(layout.tasks))
         counts = draw_episodes(shape, len(layout.episodes), self.generator)
-        methods = [self._drawn(runs, counts) for runs in self.methods]
+        methods = {name: self._drawn(runs, counts) for name, runs in self.methods.items()}
         references = {name: self._drawn(runs, counts) for name, runs in self.references.items()}
-        return [replace(rates, references=references) for rates in methods]
+        return {name: replace(rates, references=references) for name, rates in methods.items()}
 
     def _drawn(self, runs: Sequence[Scores], counts: Array) -> Rates:
         """Return the rates of `runs` over `counts` of the episodes, (replicates, runs, tasks, episodes)."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -25,12 +26,15 @@ TIE = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True)
-class Facts:
-    """What a metric states about itself. As a decorator, it enters a function into the registry.
+class Metric:
+    """A named, versioned definition of one number. A changed definition is a new version."""
 
-    The metric has the name of the function, and the first line of its docstring as its description.
-    """
-
+    name: str
+    """Name of its function and of its column everywhere."""
+    function: Function
+    """Maps rates with batch axes (...) to values (...), NaN where something is missing."""
+    description: str
+    """Meaning in one sentence."""
     formula: str
     """Formula, in words and in the letters of `clbench.scoring.ours`."""
     source: str
@@ -55,24 +59,6 @@ class Facts:
     """Whether the value is a positive ratio: its mean over seeds is geometric, and so is its interval."""
     version: int = 0
     """Number of the definition."""
-
-    def __call__(self, function: Function) -> Function:
-        """Register a function."""
-        name, description = function.__name__, (function.__doc__ or "").partition("\n")[0]
-        REGISTRY[name] = Metric(name=name, function=function, description=description, **vars(self))
-        return function
-
-
-@dataclass(frozen=True, kw_only=True)
-class Metric(Facts):
-    """A named, versioned definition of one number. A changed definition is a new version."""
-
-    name: str
-    """Name of its function and of its column everywhere."""
-    function: Function
-    """Maps rates with batch axes (...) to values (...), NaN where something is missing."""
-    description: str
-    """Meaning in one sentence."""
 
     def over_runs(self, rates: Rates) -> Array:
         """Return the value (...) over the runs of `rates`, whose last batch axis is the run: (..., runs)."""
@@ -100,5 +86,19 @@ class Metric(Facts):
 REGISTRY: dict[str, Metric] = {}
 """Metrics by name, in the order of their definition: those whose module was imported."""
 
-metric = Facts
-"""Decorator of the function of a metric: `@metric(formula=..., source=..., missing=...)`."""
+
+def metric(**facts: Any) -> Callable[[Function], Function]:
+    """Return the decorator that enters a function into the registry as a metric.
+
+    The metric has the name of the function, and the first line of its docstring as its description.
+
+    Args:
+        facts: Fields of `Metric`, apart from these: at least formula, source and missing.
+    """
+
+    def register(function: Function) -> Function:
+        name, description = function.__name__, (function.__doc__ or "").partition("\n")[0]
+        REGISTRY[name] = Metric(name=name, function=function, description=description, **facts)
+        return function
+
+    return register

@@ -42,7 +42,7 @@ USUAL_NAMES: Mapping[str, tuple[str, ...]] = {
     "average_forgetting": _FORGETTING,
     "forgetting_measure": ("forgetting_chaudhry",),
     "fm": ("forgetting_chaudhry",),
-    "bwt": ("backward_transfer",),
+    "bwt": ("backward_transfer", "backward_transfer_diaz_rodriguez"),
     "bwt+": ("positive_backward_transfer_diaz_rodriguez",),
     "fwt": _FORWARD,
     "nbt": _NEGATIVE,
@@ -60,16 +60,18 @@ USUAL_NAMES: Mapping[str, tuple[str, ...]] = {
 def load_metric(name: str) -> Metric:
     """Return the metric with this name, with this title on the board, or with this name in papers.
 
+    Spaces and hyphens count as underscores, and capitals as small letters.
+
     Raises:
         UnknownNameError: No metric has this name, and the message names the nearest one; or papers use the
             name for several metrics, and the message names them.
     """
     titles = {title.replace(" ", "_"): one for one, title in TITLES.items()}
-    wanted = name.replace(" ", "_")
+    wanted = name.lower().replace(" ", "_").replace("-", "_")
     wanted = titles.get(wanted, wanted)
     if wanted in METRICS:
         return METRICS[wanted]
-    candidates = USUAL_NAMES.get(wanted.lower().replace("-", "_"), ())
+    candidates = USUAL_NAMES.get(wanted, ())
     if len(candidates) > 1:
         raise UnknownNameError(
             f"{name!r} has several definitions: {', '.join(candidates)}. Name one of them; "

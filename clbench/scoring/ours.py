@@ -1,4 +1,4 @@
-"""The metrics of the leaderboard.
+"""The metrics of the leaderboard: clbench's own, and those of papers that its tables show.
 
 In the formulas R[l][s] is the success rate on task s at the end of stage l, stage 0 is the pretrained policy,
 target k is learned in stage k, and K is the last stage.

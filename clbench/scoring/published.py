@@ -1,9 +1,12 @@
-"""Metrics as other benchmarks, papers and libraries define them.
+"""Metrics as other benchmarks, papers and libraries define them, and two of clbench's own on other tasks.
 
 One word has many meanings in this field: here each definition carries the name of its source. As published,
 the metrics cover the sequence of learned tasks: the targets, without the retained skills and the held-out
-tasks. R[l][k] is the success on target k at the end of stage l, and K is the last stage. Between the ends of
-the stages only the current target is known, so that earlier and later targets count only at the ends.
+tasks. The last two metrics, `zero_shot_change` and `minimum_retention`, cover those; they are here because
+the order of the definitions is that of the columns of leaderboard.csv.
+
+R[l][k] is the success on target k at the end of stage l, and K is the last stage. Between the ends of the
+stages only the current target is known, so that earlier and later targets count only at the ends.
 """
 
 from __future__ import annotations

@@ -89,8 +89,7 @@ class Rates(Measured):
     @property
     def answered(self) -> Array:
         """Share of all questions answered correctly at the end of each stage, (..., stages + 1)."""
-        asked, correct = self.asked.sum(axis=-1), self.correct.sum(axis=-1)
-        return np.where(asked > 0, correct / np.maximum(asked, 1), np.nan)
+        return share_of_correct(self.asked, self.correct)
 
     @property
     def have_curves(self) -> bool:
@@ -121,12 +120,25 @@ class Rates(Measured):
         return self.each(lambda array: np.mean(array, axis=axis))
 
 
+def share_of_correct(asked: Array, correct: Array) -> Array:
+    """Return the share of correct answers (...) from counts (..., kinds), NaN if a kind was not asked."""
+    complete = (asked > 0).all(axis=-1) & (asked.sum(axis=-1) > 0)
+    return np.where(complete, correct.sum(axis=-1) / np.maximum(asked.sum(axis=-1), 1), np.nan)
+
+
 def stacked(rates: Sequence[Rates], axis: int = 0) -> Rates:
     """Return rates with one layout as one, along a new batch axis and without their references."""
     joined: dict[str, Any] = {
         name: np.stack([getattr(part, name) for part in rates], axis) for name in _arrays(Rates)
     }
     return Rates(layout=rates[0].layout, **joined)
+
+
+def leave_one_out(rates: Rates) -> Rates:
+    """Return the rates of all runs but one, for each one: (runs,), two or more, becomes (runs, runs - 1)."""
+    numbers = np.arange(len(rates.success))
+    others = np.array([np.delete(numbers, one) for one in numbers])
+    return rates.each(lambda array: array[others])
 
 
 def check_same(layouts: Iterable[Layout]) -> None:

@@ -16,6 +16,9 @@ from clbench.spec.protocol import SPLITS, Point, Protocol, check_steps
 MOST = 10**9
 """More steps, episodes or questions than any run has: a larger number is a sign of damage."""
 
+MOST_OF_ALL = 1e18
+"""Greatest number, of anything, that can be used."""
+
 MOST_POINTS = 100
 """Most evaluation points of a stage."""
 
@@ -44,7 +47,7 @@ def read_protocol(record: Record) -> Protocol:
         raise RecordError("scenario: a task name occurs twice.")
     if record.run.split not in ("test", "validation"):
         raise RecordError(f"run: split must be test or validation, not {record.run.split!r}.")
-    _check_steps(scenario.evaluation_steps)
+    _check_evaluation_steps(scenario.evaluation_steps)
     for name in ("validation_episodes", "test_episodes", "curve_episodes"):
         count = scenario.budget.get(name)
         if type(count) is not int or not 0 <= count <= MOST:
@@ -58,7 +61,7 @@ def read_protocol(record: Record) -> Protocol:
         if any(record.checks.values()):
             raise RecordError("checks: its budget has no criterion that could have been checked.")
         return scenario.protocol(record.run.split, record.run.perturb)
-    if not _is_number(criterion, 1) or len(scenario.evaluation_steps) != 1:
+    if not is_number(criterion, 0, 1) or len(scenario.evaluation_steps) != 1:
         raise RecordError("scenario: a criterion must be a success rate, with one evaluation step.")
     if record.run.trained_elsewhere:  # it chose its own steps; its stages count as full ones
         if any(record.checks.values()):
@@ -144,7 +147,8 @@ def read_relearning(record: Record, protocol: Protocol) -> Array:
     return np.array(float(found.steps))
 
 
-def _check_steps(steps: Any) -> None:
+def _check_evaluation_steps(steps: Any) -> None:
+    """Refuse evaluation steps that are impossible, or too many to be shown."""
     if (
         not isinstance(steps, list)
         or not steps
@@ -204,7 +208,7 @@ def read_episodes(record: Record, protocol: Protocol) -> list[EpisodeRow]:
             raise RecordError(f"{where} has the split {row.split!r}, which is none of {', '.join(SPLITS)}.")
         if row.success not in (0, 1):
             raise RecordError(f"{where} has the success {row.success!r}, neither true nor false.")
-        if row.total_reward is not None and not _is_number(row.total_reward, FARTHEST, -FARTHEST):
+        if row.total_reward is not None and not is_number(row.total_reward, -FARTHEST, FARTHEST):
             raise RecordError(f"{where} has an impossible return.")
         if type(row.length) is not int or not 0 <= row.length <= MOST:
             raise RecordError(f"{where} has an impossible length.")
@@ -305,7 +309,7 @@ def read_policy(record: Record, protocol: Protocol) -> tuple[Array, Array, Array
         where = f"policy: row {number}"
         point = points.check(where, stage, step)
         for value, (name, high) in zip(values, _HIGHEST.items(), strict=True):
-            if value is not None and not _is_number(value, high):
+            if value is not None and not is_number(value, 0, high):
                 raise RecordError(f"{where} has an impossible {name}.")
         if values[2:] != [None, None] and not (stage and protocol.is_end(point)):
             raise RecordError(f"{where} has a shift or a share, which only the end of a target's stage has.")
@@ -316,5 +320,6 @@ def read_policy(record: Record, protocol: Protocol) -> tuple[Array, Array, Array
     return sparsity, drift, shift[:, -1], captured[:, -1]
 
 
-def _is_number(value: Any, high: float, low: float = 0) -> bool:
+def is_number(value: Any, low: float = -MOST_OF_ALL, high: float = MOST_OF_ALL) -> bool:
+    """Return whether a value that a stranger wrote is a number from `low` to `high`."""
     return isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high

@@ -14,7 +14,7 @@ import numpy as np
 from clbench.records.record import EpisodeRow, Record
 from clbench.scoring.completeness import check_complete
 from clbench.scoring.layout import Array, Layout
-from clbench.scoring.rates import MEASURED, Measured, Rates, check_same, stacked
+from clbench.scoring.rates import MEASURED, Measured, Rates, check_same, share_of_correct, stacked
 from clbench.scoring.reading import (
     numbers,
     place,
@@ -98,7 +98,7 @@ class Scores(Measured):
             perturbed=perturbed,
             asked=counts[0, :, -1],
             correct=counts[1, :, -1],
-            answer_curves=_shares(*counts[:, 1:]),
+            answer_curves=share_of_correct(*counts[:, 1:]),
             update_sparsity=sparsity,
             activation_drift=drift,
             shift=shift,
@@ -192,12 +192,6 @@ def _success(protocol: Protocol, rows: Sequence[EpisodeRow], layout: Layout) -> 
         for row in at_point:
             there[of_task[row.task], of_episode[row.episode]] = row.success
     return found
-
-
-def _shares(asked: Array, correct: Array) -> Array:
-    """Return the share of correct answers (...) from counts (..., kinds), NaN if a kind was not asked."""
-    complete = (asked > 0).all(axis=-1) & (asked.sum(axis=-1) > 0)
-    return np.where(complete, correct.sum(axis=-1) / np.maximum(asked.sum(axis=-1), 1), np.nan)
 
 
 def rates_of(runs: Sequence[Scores], references: Mapping[str, Sequence[Scores]]) -> Rates:

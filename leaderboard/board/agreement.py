@@ -1,4 +1,4 @@
-"""Agreement on the order of the rows: Kendall's tau of two boards, Kendall's W of the seeds of one."""
+"""Orders of the rows: Kendall's W of the seeds of a board, Kendall's tau of two boards, and of predictors."""
 
 from __future__ import annotations
 
@@ -21,6 +21,17 @@ LEAST_SEEDS, LEAST_ROWS = 4, 6
 """Fewest seeds and rows of a board: Friedman's test and draws of seeds assume several seeds, and five rows
 have few orders."""
 
+PREDICTORS = {
+    "the shift of the policy on the new data": ("shift", 1.0),
+    "the share of the weights that changed": ("update_sparsity", -1.0),
+    "activation drift": ("activation_drift", 1.0),
+}
+"""Metrics that may predict what a run forgets, by their names in a sentence; 1 if they rise with forgetting,
+-1 if they fall."""
+
+BOARDS = 10_000
+"""Number of boards of equal methods that show how large a tau is by chance; no p is below 0.0001."""
+
 
 @dataclass(frozen=True)
 class Concordance:
@@ -42,33 +53,46 @@ class Concordance:
 
 
 @dataclass(frozen=True)
-class Agreement:
-    """Kendall's tau between the orders of the rows on two boards, with its range over redrawn seeds.
-
-    The range is not a confidence interval of the true tau. Redrawn seeds add noise to noisy means, which
-    pulls tau towards 0: in simulations with 12 methods, the range contained the true tau on 47 to 86 % of the
-    boards.
-    """
+class RankCorrelation:
+    """Kendall's tau between two orders of the rows, with its range over redrawn seeds."""
 
     tau: float
     """Kendall's tau: 1 for equal orders, -1 for opposite ones."""
     low: float
-    """Lower end of the range that contains 95 % of the redrawn boards."""
+    """Lower end of the range that contains 95 % of the draws."""
     high: float
     """Upper end of the range."""
     seeds: int
-    """Number of seeds in both boards together."""
+    """Number of seeds that are redrawn."""
     rows: int
     """Number of rows."""
     chance: float
-    """Probability of a tau at least as far from 0 if one board had the rows in a random order."""
+    """Probability of a tau at least as far from 0 by chance alone."""
 
     @property
     def direction(self) -> int:
-        """1: the boards agree; -1: their orders are opposite; 0: chance or the seeds may explain it."""
+        """1: the orders agree; -1: they are opposite; 0: chance or the seeds may explain it."""
         if self.chance >= SIGNIFICANCE or self.low <= 0 <= self.high:
             return 0
         return 1 if self.tau > 0 else -1
+
+
+@dataclass(frozen=True)
+class Agreement(RankCorrelation):
+    """Kendall's tau between the orders of the rows on two boards, whose seeds `seeds` counts together.
+
+    The range is not a confidence interval of the true tau. Redrawn seeds add noise to noisy means, which
+    pulls tau towards 0: in simulations with 12 methods, the range contained the true tau on 47 to 86 % of the
+    boards. `chance` is that of one board with the rows in a random order.
+    """
+
+
+@dataclass(frozen=True)
+class Prediction(RankCorrelation):
+    """Kendall's tau between a predictor and forgetting over the methods; see `chance_among_equals`."""
+
+    predictor: str
+    """Name of the predictor in a sentence: a key of `PREDICTORS`."""
 
 
 def kendall_tau(one: Array, other: Array) -> Array:
@@ -155,3 +179,53 @@ def agreement_between(one: Array, other: Array, replicates: int = REPLICATES) ->
     low, high = np.nanpercentile(kendall_tau(*drawn), (2.5, 97.5))
     seeds = sum(board.shape[1] for board in boards)
     return Agreement(tau, float(low), float(high), seeds, len(one), chance_of(*means))
+
+
+# ---- predictors --------------------------------------------------------------------------------------------
+
+
+def prediction_of(name: str, values: Array, replicates: int = REPLICATES) -> Prediction | None:
+    """Return Kendall's tau between the means over seeds of a predictor and of forgetting.
+
+    The range holds the percentiles of `replicates` draws of seeds with replacement. All rows and both
+    quantities share the draws.
+
+    Args:
+        name: Name of the predictor.
+        values: The predictor and forgetting by row and seed, (rows, seeds, 2).
+        replicates: Number of draws.
+
+    Returns:
+        None if one of the two does not order the rows at all.
+    """
+    rows, seeds, _ = values.shape
+    means = np.moveaxis(values.mean(axis=1), -1, 0)
+    tau = float(kendall_tau(*means))
+    if not np.isfinite(tau):
+        return None
+    draws = np.random.default_rng(0).integers(seeds, size=(replicates, seeds))
+    drawn = values[:, draws].mean(axis=2)  # (rows, replicates, 2)
+    low, high = np.nanpercentile(kendall_tau(drawn[..., 0].T, drawn[..., 1].T), (2.5, 97.5))
+    return Prediction(tau, float(low), float(high), seeds, rows, chance_among_equals(tau, values), name)
+
+
+def chance_among_equals(tau: float, values: Array, boards: int = BOARDS) -> float:
+    """Return the probability of a tau at least as large, of either sign, if all methods were equal.
+
+    Both quantities come from the same runs, so their noise correlates, and Kendall's own test finds an order
+    among equal methods. Here the noise of a row is what remains without the means of rows and seeds. It
+    is resampled by seed with replacement, for both quantities together.
+
+    Args:
+        tau: Kendall's tau of the board.
+        values: The predictor and forgetting by row and seed, (rows, seeds, 2).
+        boards: Number of boards of equal methods.
+    """
+    rows, seeds, _ = values.shape
+    noise = values - values.mean(axis=1, keepdims=True)
+    noise -= noise.mean(axis=0, keepdims=True)
+    draws = np.random.default_rng(0).integers(seeds, size=(boards, rows, seeds))
+    means = noise[np.arange(rows)[:, None], draws].mean(axis=2)  # (boards, rows, 2)
+    taus = kendall_tau(means[..., 0], means[..., 1])
+    taus = taus[np.isfinite(taus)]
+    return float((1 + np.sum(np.abs(taus) >= abs(tau) - 1e-9)) / (1 + len(taus)))

@@ -45,7 +45,7 @@ def commands_of(runs: Iterable[Run]) -> list[str]:
         same = list(members)
         scenario, policy = table_parts(same[0].table)
         for first, count in _in_a_row([run.seed for run in same]):
-            words = ["clbench", "run", scenario, same[0].method, "--seeds", str(count)]
+            words = ["clbench", "run", scenario, same[0].label, "--seeds", str(count)]
             words += [] if policy == DEFAULT_POLICY else ["--policy", policy]
             words += ["--first-seed", str(first)] if first else []
             words += [] if device == "cpu" else ["--device", printable(device)]

@@ -6,15 +6,16 @@ import statistics
 from collections.abc import Sequence
 from typing import Any
 
+from clbench.scoring.reading import is_number
 from clbench.spec.references import BASELINE
 
-from .runs import Run, is_number, mean_of
-from .summary import COSTS
+from .runs import Run
+from .summary import COSTS, mean_of
 
 
 def step_ratio(run: Run) -> float | None:
     """Return the time of a step of a run divided by plain fine-tuning's, None if it was not measured."""
-    if run.method == BASELINE:
+    if run.label == BASELINE:
         return 1.0
     value: Any = run.record.timing.get("step_ratio")
     return float(value) if is_number(value) and value > 0 else None

@@ -1,26 +1,22 @@
-"""The frontier: what methods learn and keep at each learning rate of the ladder.
-
-The ladder also has plain fine-tuning at settings that tuning rated as highly as the chosen one. Without them,
-a gain over the chosen setting may come from the order in which tuning tried the settings.
-"""
+"""The frontier: what methods learn and keep at each learning rate of the ladder."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from clbench.records.paths import label_of
-from clbench.runs.tuning import rated_best, tuned
-from clbench.scoring.intervals import Estimate, Runs, estimate, row_generator
+from clbench.scoring.intervals import Estimate, estimate, row_generator
+from clbench.scoring.reading import is_number
 from clbench.spec.references import BASELINE
 
 from .paths import LADDER, beside
-from .runs import ALIKE, Run, Sift, Sifted, differences, is_number, read_run, read_runs, sift_by
-from .summary import DIVISIONS, GAIN, grouped
+from .runs import ALIKE, Run, Sift, Sifted, differences, read_run, read_runs, sift_by
+from .summary import DIVISIONS, grouped
 
 FACTOR = "step_factor"
 """Hyper-parameter that the ladder changes."""
@@ -109,7 +105,7 @@ def frontiers_of(ladder: Sequence[Run]) -> dict[str, tuple[Curve, ...]]:
 
 def _is_ladder(runs: Sequence[Run]) -> bool:
     """Return whether a method, with its other changes, ran at several learning rates."""
-    return len({run.method for run in runs}) > len(set(map(apart_from_the_factor, runs)))
+    return len({run.label for run in runs}) > len(set(map(apart_from_the_factor, runs)))
 
 
 def on_the_ladder(runs: list[Run]) -> Sifted:
@@ -122,7 +118,7 @@ def _curves(runs: Sequence[Run]) -> tuple[Curve, ...]:
     """Return the curves of the runs of one scenario, over the seeds that all have, if there are any."""
     seeds: dict[str, set[int]] = {}
     for run in runs:
-        seeds.setdefault(run.method, set()).add(run.seed)
+        seeds.setdefault(run.label, set()).add(run.seed)
     common = set.intersection(*seeds.values())
     by_label: dict[str, dict[str, list[Run]]] = {}
     for run in sorted((run for run in runs if not common or run.seed in common), key=lambda run: run.seed):
@@ -149,69 +145,6 @@ def _rungs(runs: Sequence[Run]) -> tuple[Rung, ...]:
 
 
 def _rung(factor: float, runs: Sequence[Run]) -> Rung:
-    generator = row_generator(runs[0].table, runs[0].method)
+    generator = row_generator(runs[0].table, runs[0].label)
     found = estimate((LEARNED, KEPT), {run.seed: run.scores for run in runs}, generator)
     return Rung(factor, found[LEARNED], found[KEPT], tuple(run.seed for run in runs))
-
-
-# ---- tied settings -----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class TiedGain:
-    """Gain of a method over plain fine-tuning at a setting that tuning rated as highly as the chosen one."""
-
-    factor: float
-    """Step factor of plain fine-tuning."""
-    gain: Estimate
-    """Difference in final average, over the common seeds; missing if there are none."""
-    seeds: int
-    """Number of common seeds."""
-
-    @property
-    def is_certain(self) -> bool:
-        """Whether the interval is above 0."""
-        return self.gain.is_above(0)
-
-
-def side_of_zero(gain: Estimate, tied: Iterable[TiedGain]) -> int:
-    """Return where the intervals of a gain lie: 1 above 0, -1 below it, 0 if one of them contains it.
-
-    Args:
-        gain: Gain over plain fine-tuning at the setting that tuning chose.
-        tied: The gains over the settings that tuning rated as highly.
-    """
-    gains = [gain, *(one.gain for one in tied)]
-    if all(one.is_above(0) for one in gains):
-        return 1
-    return -1 if all(one.is_below(0) for one in gains) else 0
-
-
-def tied_gains(
-    scenario: str, methods: Mapping[str, Runs], ladder: Iterable[Run]
-) -> dict[str, tuple[TiedGain, ...]]:
-    """Return the gains of methods over plain fine-tuning at each tied setting, from runs of the ladder.
-
-    Args:
-        scenario: Name of the table: the scenario, with the policy if it is not the default one.
-        methods: Scores by method and seed.
-        ladder: Runs of the ladder, of any scenario and method.
-    """
-    found = tuned(scenario).get(BASELINE)
-    factors = [one.settings[FACTOR] for one in rated_best(found.tried)[1:]] if found else []
-    runs = [run for run in ladder if run.table == scenario and run.record.run.method == BASELINE]
-    tied = {
-        factor: {run.seed: run.scores for run in runs if run.record.run.changes == {FACTOR: factor}}
-        for factor in factors
-    }
-    return {
-        method: tuple(_gain(scenario, method, scores, factor, tied[factor]) for factor in factors)
-        for method, scores in methods.items()
-    }
-
-
-def _gain(scenario: str, method: str, scores: Runs, factor: float, tied: Runs) -> TiedGain:
-    common = {seed: scores[seed] for seed in sorted(tied.keys() & scores.keys())}
-    generator = row_generator(scenario, f"{GAIN} of {method} at {factor:g}")
-    gain = estimate((GAIN,), common, generator, references={BASELINE: tied})[GAIN]
-    return TiedGain(factor, gain, len(common))

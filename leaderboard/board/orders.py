@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 from clbench.scoring.metrics import measure
 
-from .runs import Run, mean_of
+from .runs import Run
+from .summary import mean_of
 
 LEAST_ORDERS = 3
 """Fewest orders for a range; a range over fewer orders means little."""

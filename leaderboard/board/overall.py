@@ -56,7 +56,10 @@ def _place(row: OverallRow) -> tuple[int, float, str]:
 
 def _overall_row(found: Mapping[str, RowSummary], tables: Mapping[str, Sequence[RowSummary]]) -> OverallRow:
     rows = list(found.values())
-    estimates = {name: mean_estimate([row.estimates[name] for row in rows]) for name in METRICS}
+    estimates = {
+        name: mean_estimate([row.estimates[name] for row in rows], ratio=metric.ratio)
+        for name, metric in METRICS.items()
+    }
     return OverallRow(
         rows[0].method,
         rows[0].division,
@@ -67,14 +70,19 @@ def _overall_row(found: Mapping[str, RowSummary], tables: Mapping[str, Sequence[
     )
 
 
-def mean_estimate(parts: Sequence[Estimate]) -> Estimate:
+def mean_estimate(parts: Sequence[Estimate], *, ratio: bool = False) -> Estimate:
     """Return the mean of independent estimates; if one is missing, there is no mean.
+
+    The mean of positive ratios (`ratio`) is geometric, unless a value or an end of an interval is 0.
 
     The interval is recovered from the parts' intervals, whose distances from their values add up in squares:
     Zou and Donner 2008, doi 10.1002/sim.3095 (MOVER). Two scenarios with tasks in common, such as Fetch-v1
     and FetchKnowledge-v1, share demonstrations and initial states. The interval does not cover that, nor does
     the interval of a single scenario.
     """
+    numbers = [end for one in parts for end in (one.value, one.low, one.high) if end is not None]
+    if ratio and min(numbers, default=0.0) > 0:
+        return mean_estimate([one.transformed(math.log) for one in parts]).transformed(math.exp)
     values = [one.value for one in parts if one.value is not None]
     if not values or len(values) < len(parts):
         return NO_ESTIMATE
@@ -83,4 +91,5 @@ def mean_estimate(parts: Sequence[Estimate]) -> Estimate:
     high = [one.high - one.value for one in parts if one.value is not None and one.high is not None]
     if len(low) < len(parts) or len(high) < len(parts):
         return Estimate(mean, None, None)
-    return Estimate(mean, mean - math.hypot(*low) / len(parts), mean + math.hypot(*high) / len(parts))
+    below, above = (math.hypot(*reach) / len(parts) for reach in (low, high))
+    return Estimate(mean, mean - below, mean + above, all(one.of_seeds for one in parts))

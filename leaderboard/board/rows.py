@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from clbench.records.fingerprints import machine_of
 from clbench.records.paths import check_folder
-from clbench.records.pinned import machine_of
 from clbench.records.record import ScenarioInfo
 from clbench.runs.tuning import CONTROL_OF, tuned
 from clbench.scoring.groups import groups
@@ -24,22 +24,29 @@ from clbench.scoring.metric import TIE
 from clbench.scoring.metrics import METRICS, measure
 from clbench.spec.references import BASELINE
 
-from .agreement import Concordance, concordance
+from .agreement import (
+    LEAST_ROWS,
+    LEAST_SEEDS,
+    PREDICTORS,
+    Concordance,
+    Prediction,
+    concordance,
+    prediction_of,
+)
+from .certainty import TiedGain, tied_gains
 from .costs import costs_of
-from .frontier import Curve, TiedGain, frontiers_of, ladder_of, read_ladder, side_of_zero, tied_gains
+from .frontier import Curve, frontiers_of, ladder_of, read_ladder
 from .orders import Orders, orders_of
-from .runs import ALIKE, Run, Sifted, mean_of, read_run, read_runs, sift_by, unlike_the_pin
+from .runs import ALIKE, Run, Sifted, read_run, read_runs, sift_by, unlike_the_pin
 from .summary import (
     DIVISIONS,
     ELSEWHERE,
-    GAIN,
     RANKED_BY,
-    WITH_DEMONSTRATIONS,
-    WITHOUT_DEMONSTRATIONS,
     RowSummary,
     Summary,
     competing,
     grouped,
+    mean_of,
 )
 from .tiers import TIERS
 
@@ -71,9 +78,11 @@ class Board(Summary):
     rows: tuple[Row, ...] = ()
     frontiers: Mapping[str, tuple[Curve, ...]] = field(default_factory=dict)
     """Methods at the learning rates of the ladder, by scenario; only scenarios with records."""
+    predictions: Mapping[str, tuple[Prediction, ...]] = field(default_factory=dict)
+    """What orders the methods as their forgetting does, by scenario."""
     tied: Mapping[str, Mapping[str, tuple[TiedGain, ...]]] = field(default_factory=dict)
     """Gains over plain fine-tuning at settings that tuning rated as highly as the chosen one, by scenario and
-    method; empty for a scenario without such a setting."""
+    competing method; none for a method of a scenario without such a setting."""
 
 
 def compute_board(records: Path, only: Container[str] | None = None) -> Board:
@@ -87,8 +96,7 @@ def compute_board(records: Path, only: Container[str] | None = None) -> Board:
         NoRecordsError: The folder does not exist.
     """
     check_folder(records)
-    runs, not_shown = read_runs(records, read_run, ALIKE, only)
-    runs, alone = _beside_rows(runs)
+    runs, not_shown = runs_of_rows(records, only)
     by_table = grouped((run.table, run) for run in sorted(runs, key=lambda run: run.table))
     found = [_scenario_rows(members) for members in by_table.values()]
     found.sort(key=lambda rows: not rows[0].to_criterion)  # stages to a criterion first
@@ -101,10 +109,23 @@ def compute_board(records: Path, only: Container[str] | None = None) -> Board:
         machines={run.table: machine_of(run.record.fingerprint) or "" for run in runs if unlike_the_pin(run)},
         unpaired={name: others for name, rows in by_name.items() if (others := unpaired(rows))},
         agreements={name: agreement(rows) for name, rows in by_name.items()},
-        not_shown=tuple(sorted([*not_shown, *alone, *without], key=lambda entry: entry.path)),
+        not_shown=tuple(sorted([*not_shown, *without], key=lambda entry: entry.path)),
         frontiers=frontiers_of(ladder),
+        predictions={name: tuple(predictions(rows)) for name, rows in by_name.items()},
         tied={name: tied_gains(name, _rivals(rows), ladder) for name, rows in by_name.items()},
     )
+
+
+def runs_of_rows(records: Path, only: Container[str] | None = None) -> Sifted:
+    """Return the runs of the board's rows, and the files that are no such run.
+
+    Args:
+        records: Folder of the records. A missing folder counts as empty.
+        only: As for `compute_board`.
+    """
+    runs, refused = read_runs(records, read_run, ALIKE, only)
+    runs, alone = _beside_rows(runs)
+    return runs, [*refused, *alone]
 
 
 def _rivals(rows: Iterable[Row]) -> dict[str, Runs]:
@@ -114,15 +135,15 @@ def _rivals(rows: Iterable[Row]) -> dict[str, Runs]:
 
 def _beside_rows(runs: list[Run]) -> Sifted:
     """Keep the runs of methods that have a row: one with the targets in the published order."""
-    with_row = {(run.table, run.method) for run in runs if not run.order}
+    with_row = {(run.table, run.label) for run in runs if not run.order}
     alone = "its method has no run with the targets in the published order, which a row needs."
-    return sift_by(runs, lambda run: "" if (run.table, run.method) in with_row else alone)
+    return sift_by(runs, lambda run: "" if (run.table, run.label) in with_row else alone)
 
 
 def _scenario_rows(runs: list[Run]) -> list[Row]:
     """Return the rows of the runs of one scenario, by division, the best first: see `_heights`."""
     by_seed = sorted((run for run in runs if not run.order), key=lambda run: run.seed)
-    by_method = grouped((run.method, run) for run in by_seed)
+    by_method = grouped((run.label, run) for run in by_seed)
     rows = []
     for division in DIVISIONS:
         members = {method: runs for method, runs in by_method.items() if runs[0].division == division}
@@ -150,7 +171,7 @@ def _row(
     """Return the row of a method; `runs` are all of the scenario, in any order."""
     members = by_method[method]
     first = members[0]
-    orders = orders_of(run for run in runs if run.method == method)
+    orders = orders_of(run for run in runs if run.label == method)
     return Row(
         scenario=first.table,
         method=method,
@@ -282,50 +303,6 @@ def standing_of(row: Row, rows: Iterable[Row]) -> Standing | None:
     return Standing(1 + len(better), len(division), tuple(other.method for other in alike))
 
 
-def apart_from_baseline(rows: Iterable[Row]) -> frozenset[str]:
-    """Return the methods of a scenario that the test of `groups` tells apart from plain fine-tuning.
-
-    Each method is tested together with plain fine-tuning and all methods with the same access: those that may
-    read prior demonstrations, or those that may not. The interval of one gain alone does not account for the
-    number of methods that were compared. A row without a final average is told apart from none.
-    """
-    members = list(rows)
-    apart: set[str] = set()
-    for divisions in (WITHOUT_DEMONSTRATIONS, WITH_DEMONSTRATIONS):
-        family = [row for row in members if row.method == BASELINE or row.division in divisions]
-        letters = groups(RANKED_BY, {row.method: row.scores for row in family})
-        if BASELINE in letters:
-            own = set(letters[BASELINE])
-            apart |= {method for method, others in letters.items() if not own & set(others)}
-    return frozenset(apart)
-
-
-def told_above(rows: Iterable[Row]) -> list[Row]:
-    """Return the rows that are told apart from plain fine-tuning at its chosen setting, and end above it."""
-    members = list(rows)
-    apart = apart_from_baseline(members)
-    return [row for row in members if row.method in apart and (row.estimates[GAIN].value or 0.0) > 0]
-
-
-def certain_sides(rows: Iterable[Row], tied: Mapping[str, Iterable[TiedGain]]) -> dict[str, int]:
-    """Return the methods that certainly end above plain fine-tuning, with 1, or below it, with -1.
-
-    They are told apart from it, and the intervals of all their gains lie on one side of 0.
-
-    Args:
-        rows: The rows of a scenario.
-        tied: Gains over settings of plain fine-tuning that tuning rated as highly, by method.
-    """
-    members = list(rows)
-    apart = apart_from_baseline(members)
-    sides = {
-        row.method: side_of_zero(row.estimates[GAIN], tied.get(row.method, ()))
-        for row in members
-        if row.method in apart
-    }
-    return {method: side for method, side in sides.items() if side}
-
-
 def agreement(rows: Iterable[Row]) -> Concordance | None:
     """Return how alike the seeds order the competing rows of a scenario; see `concordance`.
 
@@ -354,3 +331,19 @@ def values_by_seed(rows: Iterable[Row], metric: str = RANKED_BY) -> dict[str, li
             if None not in values:
                 found[row.method] = [value for value in values if value is not None]
     return found
+
+
+def predictions(rows: Iterable[Row]) -> list[Prediction]:
+    """Return how well each predictor orders the competing rows of a scenario as forgetting does.
+
+    The seeds are the baseline's. A row without one of them, or without a value, is left out.
+    """
+    to_criterion = [row for row in rows if row.to_criterion]
+    kept = values_by_seed(to_criterion, "kept_share")
+    found = []
+    for name, (metric, sign) in PREDICTORS.items():
+        values = values_by_seed(to_criterion, metric)
+        pairs = np.array([np.transpose([values[one], kept[one]]) for one in values if one in kept])
+        if len(pairs) >= LEAST_ROWS and pairs.shape[1] >= LEAST_SEEDS:
+            found.append(prediction_of(name, pairs * (sign, -1.0)))
+    return [one for one in found if one is not None]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import statistics
 from collections.abc import Callable, Container, Hashable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -13,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from clbench.base.text import printable
+from clbench.records.fingerprints import LATER, machine_of, other_parts
 from clbench.records.paths import label_of, table_name
-from clbench.records.pinned import LATER, machine_of, other_parts, pinned
+from clbench.records.pinned import pinned
 from clbench.records.reader import RecordError, check_home, home_of, read_record
 from clbench.records.record import EXTERNAL_USES, ONLINE_USES, Record, RunInfo, ScenarioInfo
 from clbench.runs.tuning import tuned_settings
@@ -25,7 +25,7 @@ from clbench.spec.protocol import FIRST_TUNING_SEED
 from clbench.spec.scenario import balanced_order, target_order
 
 from .summary import NotShown
-from .tiers import tier_of, verification_notes
+from .tiers import verification_of
 
 ACCESS = ("never", "prepare", "throughout")
 """Values of `Record.run.uses`: when a method may use prior data."""
@@ -46,7 +46,7 @@ class Run:
     """Scores of the record."""
     table: str
     """Table of the run: the scenario, with the policy if it is not the default one; see `table_name`."""
-    method: str
+    label: str
     """The method with its changed hyper-parameters, see `label_of`."""
     seed: int
     """Seed of the run."""
@@ -55,7 +55,7 @@ class Run:
     tier: str
     """One of `TIERS`."""
     findings: tuple[tuple[str, str], ...]
-    """What its verification found, as names with texts; see `verification_notes`."""
+    """What its verification found: `Verification.notes`."""
     order: int
     """Order in which the targets were learned; 0 is the published one."""
     published: ScenarioInfo
@@ -126,24 +126,23 @@ def read_run(folder: Path, path: Path, changed: bool | None = False) -> Run:
         raise RecordError(f"the run failed ({record.failure}).")
     run = record.run
     _check_kind(run, changed)
-    label = label_of(run.method, run.changes)
     name = home_of(run).as_posix()
     if record.scenario.id != run.scenario:
         raise RecordError(f"scenario: its id is {record.scenario.id!r}, but {run.scenario!r} was run.")
     _check_settings(run)
     division = division_of(run.uses)
     check_home(run, path, folder)
-    scores, published = Scores.from_record(record), _published(record)
+    scores, published, verification = Scores.from_record(record), _published(record), verification_of(path)
     return Run(
         name,
         record,
         scores,
         table_name(run.scenario, run.policy),
-        label,
+        label_of(run.method, run.changes),
         run.seed,
         division,
-        tier_of(path),
-        tuple(verification_notes(path)),
+        verification.tier,
+        verification.notes,
         run.order,
         published,
     )
@@ -369,7 +368,7 @@ def same_settings(runs: list[Run]) -> Sifted:
         fields = [name for one, another in both for name in differences(one, another)]
         return f"its settings do not match most seeds: {', '.join(fields)} differ."
 
-    return _most(runs, lambda run: (run.table, run.method), lambda run: _text(parts(run)), reason)
+    return _most(runs, lambda run: (run.table, run.label), lambda run: _text(parts(run)), reason)
 
 
 def _learner(run: Run) -> dict[str, Any]:
@@ -437,14 +436,3 @@ def differences(values: Any, others: Any) -> list[str]:
     return [
         name for name in names if name not in values or name not in others or values[name] != others[name]
     ]
-
-
-def mean_of(values: Iterable[float | None]) -> float | None:
-    """Return the mean of the values that are known, None if none is."""
-    known = [value for value in values if value is not None]
-    return statistics.fmean(known) if known else None
-
-
-def is_number(value: Any) -> bool:
-    """Return whether a value that a stranger wrote is a usable number."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e18

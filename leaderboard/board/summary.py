@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol, TypeVar
@@ -170,6 +171,18 @@ Key = TypeVar("Key")
 Value = TypeVar("Value")
 
 
+def in_order_of(rows: Iterable[OneRow], metric: str) -> tuple[OneRow, ...]:
+    """Return the rows, each division of each table by the value of a metric, the best first, missing last."""
+    sign = -1 if METRICS[metric].higher_is_better is False else 1
+
+    def place(row: RowSummary) -> tuple[bool, float]:
+        value = row.estimates[metric].value
+        return value is None, 0.0 if value is None else -sign * value
+
+    divisions = (members for table in tables_of(rows).values() for members in divisions_of(table).values())
+    return tuple(row for members in divisions for row in sorted(members, key=place))
+
+
 def letters_of(row: RowSummary, rows: Iterable[RowSummary]) -> str:
     """Return the letters of a row; empty if its division has no other row to tell it apart from.
 
@@ -194,6 +207,12 @@ def divisions_of(rows: Iterable[PlacedRow]) -> dict[str, list[PlacedRow]]:
 def competing(rows: Iterable[PlacedRow]) -> list[PlacedRow]:
     """Return the rows of methods, which compete; references and policies from other programs do not."""
     return [row for row in rows if row.division in METHODS]
+
+
+def mean_of(values: Iterable[float | None]) -> float | None:
+    """Return the mean of the values that are known, None if none is."""
+    known = [value for value in values if value is not None]
+    return statistics.fmean(known) if known else None
 
 
 def grouped(pairs: Iterable[tuple[Key, Value]]) -> dict[Key, list[Value]]:

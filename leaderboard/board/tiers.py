@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,24 +27,29 @@ def verification_path(record: Path) -> Path:
     return record.with_suffix(".verified")
 
 
+@dataclass(frozen=True)
+class Verification:
+    """What the file of a verification says about a record, if it holds for its bytes."""
+
+    tier: str = TIERS[0]
+    """One of `TIERS`."""
+    notes: tuple[tuple[str, str], ...] = ()
+    """Tier, verifier, time and what each check found, as names with texts."""
+
+
+def verification_of(record: Path) -> Verification:
+    """Return the verification of the record at `record`, a self-reported one if none holds for its bytes."""
+    values = _read(record)
+    about = [(name, values.get(name)) for name in ("tier", "by", "time")]
+    checks = [one for one in values.get("checks", ()) if isinstance(one, dict)]
+    named = (*about, *((one.get("name"), one.get("found")) for one in checks))
+    notes = [(name, text) for name, text in named if isinstance(name, str) and isinstance(text, str)]
+    return Verification(str(values.get("tier", TIERS[0])), tuple(notes))
+
+
 def tier_of(record: Path) -> str:
     """Return the tier of the record at `record`, "self-reported" if no verification holds for its bytes."""
-    return str(_verification(record).get("tier", TIERS[0]))
-
-
-def checks_of(record: Path) -> list[Any]:
-    """Return the checks that gave the record at `record` its tier, empty without a valid verification."""
-    return [*_verification(record).get("checks", ())]
-
-
-def verification_notes(record: Path) -> list[tuple[str, str]]:
-    """Return who verified the record at `record`, when, and what each check found, as names with texts."""
-    values = _verification(record)
-    about = [(name, values.get(name)) for name in ("tier", "by", "time")]
-    checks = [(one.get("name"), one.get("found")) for one in checks_of(record) if isinstance(one, dict)]
-    return [
-        (name, text) for name, text in (*about, *checks) if isinstance(name, str) and isinstance(text, str)
-    ]
+    return verification_of(record).tier
 
 
 def verification_text(values: Mapping[str, Any]) -> str:
@@ -51,8 +57,8 @@ def verification_text(values: Mapping[str, Any]) -> str:
     return json.dumps({**values, "content": content_hash(values)}, indent=1) + "\n"
 
 
-def _verification(record: Path) -> dict[str, Any]:
-    """Return the verification of a record, empty if it is damaged or does not hold for its bytes."""
+def _read(record: Path) -> dict[str, Any]:
+    """Return the values in the file of a verification, empty if it is damaged or does not hold."""
     try:
         values = read_json(verification_path(record))
         whole = values["content"] == content_hash(values) and values["tier"] in TIERS

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from clbench.base.text import counted
+from clbench.scoring.reading import is_number
 
-from ..board.runs import is_number
 from .claim import (
     ANYWHERE,
     BOARDS,
@@ -25,10 +25,11 @@ from .claim import (
     not_told_apart,
     what_would_change,
 )
-from .evidence import SHARE, Evidence, Figure
+from .evidence import SHARE, Evidence, Figure, rung
 from .figures import (
     ENDS,
     RANDOM,
+    SCENARIO_RATE,
     anchor_distance,
     anchor_ratio,
     answer_curve,
@@ -124,7 +125,8 @@ def stop_gradient_keeps_and_wastes(evidence: Evidence) -> Finding:
     answers, early = question_drop(evidence, "stop_gradient"), early_success(evidence, "stop_gradient", "sft")
     of_sft = question_drop(evidence, "sft")
     if loses_no_answers(of_sft):
-        return _by_steps(share_of_steps(evidence, "stop_gradient@1", "sft@1"), (early, answers, of_sft))
+        at_one = (rung(method, SCENARIO_RATE) for method in ("stop_gradient", "sft"))
+        return _by_steps(share_of_steps(evidence, *at_one), (early, answers, of_sft))
     if of_sft.is_unknown:
         return Finding("undecided", (early, answers), (of_sft,), change=what_would_change(of_sft, 0.01))
     by_answers = answers.low > 0.01 or early.high < -0.05

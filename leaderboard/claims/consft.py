@@ -8,7 +8,8 @@ from dataclasses import replace
 from itertools import chain
 from typing import Any
 
-from ..board.runs import is_number
+from clbench.scoring.reading import is_number
+
 from .arms import (
     ARMS,
     arms_that_count,
@@ -41,8 +42,8 @@ from .consft_controls import (
 )
 from .evidence import Evidence, Figure, rung
 from .figures import (
-    PUBLISHED,
-    kept,
+    SCENARIO_RATE,
+    retention_difference,
     retention_drop,
     share_afterwards,
     share_between,
@@ -67,13 +68,14 @@ WITH_LIBERO = (*BOARDS, "clbench/LiberoSpatial-v1")
 )
 def sft_degrades(evidence: Evidence) -> Finding:
     """Unconstrained fine-tuning degrades pretrained skills."""
-    drop, published = (retention_drop(evidence, label) for label in ("sft", rung("sft", PUBLISHED)))
-    joint = kept(evidence, "joint", rung("sft", PUBLISHED))  # joint has the scenario's learning rate
+    drop, at_one = (retention_drop(evidence, label) for label in ("sft", rung("sft", SCENARIO_RATE)))
+    # joint has the scenario's learning rate
+    joint = retention_difference(evidence, "joint", rung("sft", SCENARIO_RATE))
     learned = evidence.metric("adaptation", "joint")
     sparse = replace(evidence.metric("update_sparsity", "sft"), note="density is not judged")
     return Finding(
         decided(holds=drop.low > 0.05, fails=drop.high < 0.05),
-        (drop, published),
+        (drop, at_one),
         (retention_drop(evidence, "frozen"), retention_drop(evidence, "joint"), joint, sparse),
         _what_joint_says(joint, learned),
         what_would_change(drop, 0.05),
@@ -114,13 +116,17 @@ def _what_joint_says(gain: Figure, learned: Figure) -> tuple[str, ...]:
 def keeps_20_points_more(evidence: Evidence) -> Finding:
     """Keeps pretrained skills on average more than 20 points better than plain fine-tuning."""
     arms = arms_that_count(evidence)
-    at_best = [kept(evidence, arm, "sft") for arm in ARMS]
-    at_one = [kept(evidence, rung(arm, PUBLISHED), rung("sft", PUBLISHED)) for arm in ARMS]
-    sft = [evidence.metric("retention", label) for label in ("sft", rung("sft", PUBLISHED))]
+    at_best = [retention_difference(evidence, arm, "sft") for arm in ARMS]
+    at_one = [
+        retention_difference(evidence, rung(arm, SCENARIO_RATE), rung("sft", SCENARIO_RATE)) for arm in ARMS
+    ]
+    sft = [evidence.metric("retention", label) for label in ("sft", rung("sft", SCENARIO_RATE))]
     counting = [figure for figure in at_best if figure.methods[0] in arms]
-    published = [figure for figure in at_one if figure.methods[0] in {rung(arm, PUBLISHED) for arm in arms}]
+    counting_at_one = [
+        figure for figure in at_one if figure.methods[0] in {rung(arm, SCENARIO_RATE) for arm in arms}
+    ]
     every, keeps_too_much = [*at_best, *at_one], all(one.low > 0.80 for one in sft)
-    verdict, of_all = _keeps_more(counting, published, every), _keeps_more(at_best, at_one, every)
+    verdict, of_all = _keeps_more(counting, counting_at_one, every), _keeps_more(at_best, at_one, every)
     best = best_first(counting or at_best)[0]
     if verdict == "holds":
         best = deciding(verdict, counting, 0.20)
@@ -128,11 +134,13 @@ def keeps_20_points_more(evidence: Evidence) -> Finding:
     controls = controls_of(evidence, best.methods[0])
     controls_at_one = controls_at_the_full_rate(evidence)
     arm = best.methods[0]
-    alike = [kept(evidence, arm, label) for label in sft_at_the_rate_of(evidence, arm)]
+    alike = [retention_difference(evidence, arm, label) for label in sft_at_the_rate_of(evidence, arm)]
     shares = tuple(one(evidence, arm) for arm in ARMS for one in (share_between, share_afterwards))
     shown = (*sft, *alike, *controls, *controls_at_one, *shares)
     at_one_says = what_the_full_rate_says(best_first(at_one)[0], controls_at_one)
-    may_hold = {"holds": counting, "holds in part": published}.get(verdict, [*counting, *published])
+    may_hold = {"holds": counting, "holds in part": counting_at_one}.get(
+        verdict, [*counting, *counting_at_one]
+    )
     if not arms or keeps_too_much:
         reasons = [*inactive_reasons(evidence, arms), *([KEEPS_TOO_MUCH] if keeps_too_much else [])]
         if_they_did = if_all_counted(arms, "cannot be shown here", of_all) if not keeps_too_much else ()
@@ -199,7 +207,7 @@ REPLAYS = ("experience_replay", "buffered_replay")
 def as_good_as_replay(evidence: Evidence) -> Finding:
     """As good as experience replay, without prior data."""
     replays = [one for one in REPLAYS if evidence.runs.get(one)] or REPLAYS
-    every = {arm: [kept(evidence, arm, replay) for replay in replays] for arm in ARMS}
+    every = {arm: [retention_difference(evidence, arm, replay) for replay in replays] for arm in ARMS}
     of_all, counting = _reaches(every.values(), every.values()), arms_that_count(evidence)
     arms = [every[arm] for arm in counting]
     if not arms:
@@ -287,7 +295,7 @@ def stays_sparse(evidence: Evidence) -> Finding:
     every = {arm: _sparser(evidence, arm, "sft") for arm in ARMS}
     counting = arms_that_count(evidence)
     arms = [every[arm] for arm in counting]
-    response = _sparser(evidence, _small_steps(evidence), rung("sft", PUBLISHED))
+    response = _sparser(evidence, _small_steps(evidence), rung("sft", SCENARIO_RATE))
     controls = (response, _sparser(evidence, "l2_sp", "sft"))
     insensitive = (
         f"Much smaller steps keep only {response.value:.3f} more of the weights in place: a method that "

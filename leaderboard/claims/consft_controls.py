@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from .claim import not_told_apart
 from .evidence import Evidence, Figure, rung
-from .figures import PUBLISHED, kept
+from .figures import SCENARIO_RATE, retention_difference
 
 CONTROLS = {
     "constant_weight": (
@@ -27,14 +27,17 @@ CONTROLS = {
 
 def controls_of(evidence: Evidence, arm: str) -> tuple[Figure, ...]:
     """Return the gains in retained success over the controls: two of consft_calibrated, and one of `arm`."""
-    first = [kept(evidence, "consft_calibrated", name) for name in ("constant_weight", "shuffled_weights")]
-    return (*first, kept(evidence, arm, "finch"))
+    first = [
+        retention_difference(evidence, "consft_calibrated", name)
+        for name in ("constant_weight", "shuffled_weights")
+    ]
+    return (*first, retention_difference(evidence, arm, "finch"))
 
 
 def sft_at_the_rate_of(evidence: Evidence, arm: str) -> tuple[str, ...]:
     """Return the label of sft at the arm's learning rate, if tuning chose another for sft and runs exist."""
     runs = [evidence.first_run(label) for label in (arm, "sft")]
-    factors = [run.record.run.settings.get("step_factor", PUBLISHED) for run in runs if run is not None]
+    factors = [run.record.run.settings.get("step_factor", SCENARIO_RATE) for run in runs if run is not None]
     if len(factors) < len(runs) or factors[0] == factors[1]:
         return ()
     label = rung("sft", factors[0])
@@ -43,9 +46,9 @@ def sft_at_the_rate_of(evidence: Evidence, arm: str) -> tuple[str, ...]:
 
 def controls_at_the_full_rate(evidence: Evidence) -> tuple[Figure, ...]:
     """Return the gains of consft_calibrated over two controls at the scenario's rate, if runs exist."""
-    labels = [f"{name}+step_factor={PUBLISHED}" for name in ("constant_weight", "shuffled_weights")]
-    arm = rung("consft_calibrated", PUBLISHED)
-    return tuple(kept(evidence, arm, label) for label in labels if label in evidence.runs)
+    labels = [f"{name}+step_factor={SCENARIO_RATE}" for name in ("constant_weight", "shuffled_weights")]
+    arm = rung("consft_calibrated", SCENARIO_RATE)
+    return tuple(retention_difference(evidence, arm, label) for label in labels if label in evidence.runs)
 
 
 def what_the_full_rate_says(gain: Figure, controls: Sequence[Figure]) -> list[str]:

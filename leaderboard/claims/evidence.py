@@ -17,19 +17,20 @@ from clbench.scoring.intervals import (
     NO_ESTIMATE,
     UNBOUNDED,
     Estimate,
+    Quantity,
     Span,
-    bootstrap,
+    estimate_quantity,
     mean_of_seeds,
     row_generator,
 )
-from clbench.scoring.layout import Array
 from clbench.scoring.metrics import load_metric
 from clbench.scoring.rates import Rates
+from clbench.scoring.reading import is_number
 from clbench.scoring.scores import Scores
 
 from ..board.costs import step_ratio
 from ..board.frontier import FACTOR, apart_from_the_factor, ladder_of, like_the_board, read_ladder
-from ..board.runs import ALIKE, Run, is_number, read_run, read_runs
+from ..board.runs import ALIKE, Run, read_run, read_runs
 from ..board.summary import NotShown
 
 LEAST_SEEDS = 2
@@ -40,8 +41,6 @@ SHARE: Span = (0.0, 1.0)
 
 Of = Mapping[str, Rates]
 """Rates by label of the method: same seeds, same draws, batch axes (..., runs)."""
-Quantity = Callable[[Of], Array]
-"""Maps rates with batch axes (..., runs) to values (...)."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +137,7 @@ class Evidence:
         if common and not missing:
             generator = row_generator(self.scenario, what)
             scores = self._scores(methods, common)
-            found = bootstrap(quantity, scores, generator, span=span, ratio=ratio)
+            found = estimate_quantity(quantity, scores, generator, span=span, ratio=ratio)
         if not missing and not note:
             if not common:
                 note = "the methods have no seed in common"
@@ -205,22 +204,20 @@ class Evidence:
         return self._mean_of(method, what, values, form, span)
 
     def pooled(
-        self, method: str, what: str, read: Callable[[Sequence[Mapping[str, Any]]], Any], span: Span
+        self, method: str, what: str, read: Callable[[Mapping[str, Any]], float], span: Span
     ) -> Figure:
-        """Return the mean over seeds of what `read` computes from the diagnostics of all stages of a run."""
+        """Return the mean over seeds of what `read` computes from the diagnostics of a run, by stage.
 
-        def values(run: Run) -> list[Any]:
-            value = read([found for found in run.record.diagnostics.values() if isinstance(found, dict)])
-            return [] if value is None else [value]
-
-        return self._mean_of(method, what, values, ".2f", span)
+        `read` returns NaN for diagnostics without a usable number.
+        """
+        return self._mean_of(method, what, lambda run: [read(run.record.diagnostics)], ".2f", span)
 
     def diagnostic_ratio(
         self, method: str, other: str, what: str, read: Callable[[Mapping[str, Any]], float]
     ) -> Figure:
         """Return the ratio of what `read` computes from the diagnostics of two methods, seed by seed.
 
-        The ratio is averaged over seeds; `read` returns NaN for diagnostics without a usable number.
+        The ratio is averaged over seeds; `read` is as for `pooled`.
         """
         seeds = self.common_seeds((method, other))
         parts, wholes = (
@@ -323,7 +320,7 @@ def read_evidence(records: Path, controls: Path) -> Callable[[str], Evidence]:
     changed, refused_controls = read_runs(controls, partial(read_run, changed=True), sifts)
     rungs, refused_rungs = read_ladder(ladder_of(records), scored)
     labelled = [
-        *((run.method, run) for run in (*scored, *changed)),
+        *((run.label, run) for run in (*scored, *changed)),
         *((rung(apart_from_the_factor(run), run.record.run.changes[FACTOR]), run) for run in rungs),
     ]
     named = (("records", refused), ("controls", refused_controls))

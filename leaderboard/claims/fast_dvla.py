@@ -14,16 +14,16 @@ from clbench.scoring.intervals import NO_ESTIMATE, Estimate
 from ..policies.decoders import Decoding, read_decoding
 from .claim import ANYWHERE, Finding, Paper, cannot_be_shown, claim, decided, is_open, what_would_change
 from .evidence import Evidence, Figure, rung
-from .figures import PUBLISHED, loses_no_answers, median_stage, question_drop, share_of_steps
+from .figures import SCENARIO_RATE, loses_no_answers, median_stage, question_drop, share_of_steps
 
 CAPVECTOR = Paper("CapVector (the abstract of Fast-dVLA)", ("2603.25661", "2605.10903"))
 FAST_DVLA = Paper("Fast-dVLA's body", ("2603.25661",))
 
-SFT = rung("sft", PUBLISHED)
-VECTOR = rung("fast_dvla", PUBLISHED)
-CO_TRAINING = f"co_training+step_factor={PUBLISHED}"
-AT_RANDOM = f"fast_dvla+direction=random+step_factor={PUBLISHED}"
-NO_REGULARISER = f"fast_dvla+orthogonal=0.0+step_factor={PUBLISHED}"
+SFT = rung("sft", SCENARIO_RATE)
+VECTOR = rung("fast_dvla", SCENARIO_RATE)
+CO_TRAINING = f"co_training+step_factor={SCENARIO_RATE}"
+AT_RANDOM = f"fast_dvla+direction=random+step_factor={SCENARIO_RATE}"
+NO_REGULARISER = f"fast_dvla+orthogonal=0.0+step_factor={SCENARIO_RATE}"
 
 NO_CAPABILITY = (
     "The auxiliary objective certainly saves less than 5 % of the steps, so it gives no faster learning that "

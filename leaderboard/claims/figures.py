@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from clbench.scoring.intervals import Estimate
+from clbench.scoring.intervals import NO_ESTIMATE, Estimate
 from clbench.scoring.layout import Array, average
 from clbench.scoring.rates import Rates
+from clbench.scoring.reading import is_number
 from clbench.scoring.scores import Scores
 
-from ..board.runs import is_number
 from .evidence import SHARE, Evidence, Figure, Of
 
-PUBLISHED = 1.0
+SCENARIO_RATE = 1.0
 """Rung of the ladder with the scenario's own learning rate."""
 
 
@@ -33,7 +33,7 @@ def retention_drop(evidence: Evidence, method: str) -> Figure:
     return evidence.figure(what, drop, method, span=(-1, 1))
 
 
-def kept(evidence: Evidence, method: str, other: str) -> Figure:
+def retention_difference(evidence: Evidence, method: str, other: str) -> Figure:
     """Return the difference in success on the retained skills after the last target."""
 
     def difference(of: Of) -> Array:
@@ -219,12 +219,7 @@ ENDS = {"before the first step": 0, "at the end of the first stage": -1}
 def anchor_distance(evidence: Evidence, method: str, end: str) -> Figure:
     """Return the distance of a batch to AEGIS's anchor at one of `ENDS`, mean over seeds."""
     what = f"distance of a batch to the anchor {end}, {method}"
-
-    def read(stages: Sequence[Mapping[str, Any]]) -> float | None:
-        found = _distance({"1": stages[0]}, ENDS[end]) if stages else math.nan
-        return None if math.isnan(found) else found
-
-    return evidence.pooled(method, what, read, (0, math.inf))
+    return evidence.pooled(method, what, partial(_distance, place=ENDS[end]), (0, math.inf))
 
 
 def _distance(diagnostics: Mapping[str, Any], place: int) -> float:
@@ -241,11 +236,12 @@ def _distance(diagnostics: Mapping[str, Any], place: int) -> float:
 def median_stage(evidence: Evidence, method: str) -> Figure:
     """Return the median of the steps to the criterion over targets and seeds, without an interval."""
     runs = evidence.runs.get(method, {})
-    steps = [run.scores.rates().steps for run in runs.values()]
-    value = float(np.median(steps)) if steps else None
-    missing = () if runs else (method,)
+    steps = np.array([run.scores.rates().steps for run in runs.values()])
+    is_known = steps.size > 0 and bool(np.isfinite(steps).all())  # stages of a fixed length have none
+    found = Estimate(float(np.median(steps)), None, None) if is_known else NO_ESTIMATE
+    missing, note = (() if runs else (method,)), "" if is_known or not runs else "not in these records"
     what = f"steps to the criterion of {method}, median"
-    return Figure(what, (method,), Estimate(value, None, None), tuple(runs), missing, form=".0f")
+    return Figure(what, (method,), found, tuple(runs), missing, note, ".0f")
 
 
 def share_between(evidence: Evidence, method: str, afterwards: bool = False) -> Figure:
@@ -261,10 +257,10 @@ def share_between(evidence: Evidence, method: str, afterwards: bool = False) -> 
         afterwards: Whether to take the weights of the last tenth and after it instead.
     """
 
-    def share(stages: Sequence[Mapping[str, Any]]) -> float | None:
-        chosen = [table[-1:] if afterwards else table[:-1] for table in _weights(stages)]
+    def share(diagnostics: Mapping[str, Any]) -> float:
+        chosen = [table[-1:] if afterwards else table[:-1] for table in _weights(diagnostics)]
         total = sum(float(table.sum()) for table in chosen)
-        return sum(float(table[:, 1:-1].sum()) for table in chosen) / total if total > 0 else None
+        return sum(float(table[:, 1:-1].sum()) for table in chosen) / total if total > 0 else math.nan
 
     part = "last tenth of the schedule and after it" if afterwards else "first nine tenths of the schedule"
     return evidence.pooled(
@@ -278,16 +274,17 @@ def share_afterwards(evidence: Evidence, method: str) -> Figure:
     A stage to a criterion may last longer than the schedule, so that this part may be the larger one.
     """
 
-    def share(stages: Sequence[Mapping[str, Any]]) -> float | None:
-        tables = _weights(stages)
+    def share(diagnostics: Mapping[str, Any]) -> float:
+        tables = _weights(diagnostics)
         total = sum(float(table.sum()) for table in tables)
-        return sum(float(table[-1].sum()) for table in tables) / total if total > 0 else None
+        return sum(float(table[-1].sum()) for table in tables) / total if total > 0 else math.nan
 
     what = f"share of the weights of {method} in the last tenth of the schedule and after it"
     return evidence.pooled(method, what, share, SHARE)
 
 
-def _weights(stages: Sequence[Mapping[str, Any]]) -> list[Array]:
+def _weights(diagnostics: Mapping[str, Any]) -> list[Array]:
     """Return the histograms of the weights of each stage, (tenths of the schedule, bins)."""
+    stages = (stage for stage in diagnostics.values() if isinstance(stage, dict))
     tables = (np.asarray(stage.get("omega_counts", []), dtype=np.float64) for stage in stages)
     return [table for table in tables if table.ndim == 2 and table.shape[1] > 2]

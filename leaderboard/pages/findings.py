@@ -21,8 +21,8 @@ from ..claims.claim import DECIDED, PREDICATES
 from ..claims.evidence import Evidence
 from ..claims.judges import Judged
 from ..policies.compared import Comparison, by_table
+from ..views.charts.picture import in_both_themes
 from ..views.format import MISSING, format_interval
-from ..views.page.charts.picture import in_both_themes
 from ..views.sections import Section, Table, short
 from ..views.templating import template
 from .agreements import orders_section, predictors_section

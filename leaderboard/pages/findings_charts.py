@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from ..board.frontier import Curve
 from ..board.rows import Row
 from ..board.summary import DIVISIONS
-from ..views.page.charts.vega import FONT, SHAPES, Spec, axis, colour, heading, layer, rounded, specification
+from ..views.charts.vega import FONT, SHAPES, Spec, axis, colour, heading, layer, rounded, specification
 
 WIDTH = 520
 """Width of the plot in pixels."""

@@ -13,13 +13,13 @@ from clbench.base.text import listed
 from clbench.learning.registry import load_method
 from clbench.runs.tuning import CONTROL_OF, Tuned, fixed_settings, rated_best, tuned, tuned_scenarios
 from clbench.scoring.intervals import UNBOUNDED, Estimate
+from clbench.scoring.reading import is_number
 from clbench.spec.identifiers import folder_name
 from clbench.spec.references import BASELINE, FROZEN
 
 from ..board.commands import commands_of, run_command
 from ..board.frontier import FACTOR
 from ..board.rows import Row
-from ..board.runs import is_number
 from ..board.summary import DIVISIONS, grouped
 from ..claims.aegis import SHARES
 from ..claims.evidence import SHARE, Evidence

@@ -22,7 +22,7 @@ from clbench.scoring.groups import deviation_of_differences, least_difference
 from clbench.scoring.intervals import (
     NO_ESTIMATE,
     Estimate,
-    bootstrap,
+    estimate_quantity,
     paired_difference,
     row_generator,
 )
@@ -180,7 +180,7 @@ class Card:
         """Return the mean of a quantity (..., runs) over the runs of a row; most are about how runs begin."""
         generator = row_generator(self.scenario.id, f"pretrained {quantity.__name__}")
         runs = {"one": list(row.scores.values())}
-        return bootstrap(lambda of: average(quantity(of["one"])), runs, generator, span=span)
+        return estimate_quantity(lambda of: average(quantity(of["one"])), runs, generator, span=span)
 
     def _bars(self) -> list[Bar]:
         """Return the bars; without retained skills, fine-tuning must forget the earlier targets instead."""

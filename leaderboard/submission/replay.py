@@ -44,9 +44,9 @@ def replay(subject: Subject, progress: ProgressCallback) -> list[Check]:
     Raises:
         MethodError: The method fails when it is run again.
     """
-    run, spec = subject.run, subject.spec
+    spec = subject.spec
     if subject.strange:
-        options = " and ".join("--method" if name == run.method else "--policy" for name in subject.strange)
+        options = " and ".join("--method" if name == spec.method else "--policy" for name in subject.strange)
         names = " and ".join(subject.strange)
         result = f"{names} is not installed: name it with {options} to import and run its code"
         return [Check("policies", result, None)]

@@ -29,16 +29,17 @@ from clbench.jobs.scheduler import run_with_bars
 from clbench.learning.optimise import MethodError
 from clbench.learning.pretraining import pretrain
 from clbench.policy.checkpoint import save_policy
-from clbench.records.pinned import LATER, other_parts, other_versions
+from clbench.records.fingerprints import LATER, other_parts, other_versions
 from clbench.records.reader import RecordError, UnreadableRecordError
 from clbench.records.record import Record, RunInfo, ScenarioInfo
 from clbench.runs.length import run_length
 from clbench.runs.run import execute, pretrained_hash
 from clbench.runs.spec import describe_scenario
 from clbench.scoring.metrics import measure
+from clbench.scoring.reading import is_number
 from clbench.spec.scenario import Scenario
 
-from ..board.runs import differences, is_number, read_run
+from ..board.runs import differences, read_run
 from ..board.summary import ELSEWHERE
 from ..board.tiers import TIERS, tier_of, verification_path, verification_text
 from ..views.files import write_all
@@ -355,7 +356,7 @@ def _as_dictionary(part: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class Verification:
+class Outcome:
     """The outcome of the verification of a record."""
 
     path: Path
@@ -368,14 +369,14 @@ class Verification:
 
 def run_verifications(
     paths: Sequence[Path], records: Path, request: Request, workers: int | None, console: Console
-) -> list[Verification]:
+) -> list[Outcome]:
     """Verify records, each in its own process."""
     with tempfile.TemporaryDirectory() as folder:
         reports = {path: Path(folder) / f"{number}.json" for number, path in enumerate(paths)}
         jobs = {path: _job(path, records, request, report) for path, report in reports.items()}
         device = "cuda" if any(job.device == "cuda" for job in jobs.values()) else "cpu"
         failed = run_with_bars([*jobs.values()], Processes(workers, device), console)
-        return [Verification(path, _read(reports[path]), failed.get(job)) for path, job in jobs.items()]
+        return [Outcome(path, _read(reports[path]), failed.get(job)) for path, job in jobs.items()]
 
 
 def _read(report: Path) -> list[dict[str, Any]]:

@@ -16,10 +16,9 @@ from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import METRICS, TITLES
 from clbench.scoring.scores import WEAK, WEAK_WARNING
 
-from ..board.agreement import Agreement, Concordance
-from ..board.frontier import TiedGain, side_of_zero
+from ..board.agreement import Concordance, Prediction, RankCorrelation
+from ..board.certainty import TiedGain, side_of_zero
 from ..board.overall import OverallRow
-from ..board.predictors import predictions
 from ..board.rows import Row, standing_of
 from ..board.summary import DIVISIONS, GAIN, RowSummary
 from ..board.tiers import TIERS
@@ -189,9 +188,8 @@ def chance_text(chance: float) -> str:
     return f"p = {chance:.2g}" if chance >= 0.001 else "p < 0.001"
 
 
-def prediction_text(rows: Iterable[Row]) -> str:
+def prediction_text(found: Sequence[Prediction]) -> str:
     """Return a sentence on what predicts forgetting among the methods; empty if nothing is known."""
-    found = predictions(rows)
     if not found:
         return ""
     words = {1: "", 0: " (not certain)", -1: " (in the opposite order)"}
@@ -202,7 +200,7 @@ def prediction_text(rows: Iterable[Row]) -> str:
     )
 
 
-def tau_text(found: Agreement) -> str:
+def tau_text(found: RankCorrelation) -> str:
     """Return Kendall's tau with its range over redrawn seeds and the probability of chance."""
     ends = " to ".join(number_text(end, ".2f") for end in (found.low, found.high))
     return f"{number_text(found.tau, '.2f')}, {ends} with redrawn seeds, {chance_text(found.chance)}"

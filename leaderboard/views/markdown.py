@@ -9,9 +9,9 @@ from clbench.base.text import counted
 from clbench.records.paths import table_parts
 from clbench.scoring.metric import Metric
 
-from ..board.frontier import TiedGain
+from ..board.certainty import TiedGain, sides_of_gains
 from ..board.overall import overall
-from ..board.rows import Board, Row, certain_sides, told_above
+from ..board.rows import Board, Row
 from ..board.summary import letters_of, tables_of
 from ..policies.compared import Comparisons
 from ..policies.decoders import read_decoding
@@ -64,11 +64,11 @@ def markdown(board: Board, comparisons: Comparisons) -> str:
 
 def _tied_text(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]]) -> str:
     """Return sentences on rows told apart above plain fine-tuning, but not certainly above it."""
-    sides = certain_sides(rows, tied)
+    sides = sides_of_gains(rows, tied)
     return " ".join(
         gain_text(name, row.method, row.estimates["gain"], tied.get(row.method, ()))
-        for row in told_above(rows)
-        if row.method not in sides
+        for row in rows
+        if sides.get(row.method) == 0 and (row.estimates["gain"].value or 0.0) > 0
     )
 
 

@@ -90,15 +90,15 @@ def terminal(table: Summary, width: int = 108, sort: str | None = None) -> Rende
     Args:
         table: The table.
         width: Width of the terminal in characters; columns that do not fit are named below each table.
-        sort: Name of the metric that orders the rows of each division, the best first; its column is always
-            shown. None for the board's own order.
+        sort: Name of the metric that the rows are sorted by, whose column is always shown; None for the
+            board's own order.
     """
     # Text and not str: rich would obey markup in a stranger's words.
     parts: list[RenderableType] = []
     tables: list[Rows] = []
     for scenario, rows in tables_of(table.rows).items():
         tables.append(rows)
-        parts += _fitted(scenario, _sorted(rows, sort), _heads(rows, sort), width)
+        parts += _fitted(scenario, rows, _heads(rows, sort), width)
         sentences = (
             start_text(table.starts.get(scenario)),
             machine_text(table.machines.get(scenario)),
@@ -121,19 +121,6 @@ def terminal(table: Summary, width: int = 108, sort: str | None = None) -> Rende
         parts.append(Text("Not shown", style="bold"))
         parts += [Text(f"  {entry}", overflow="fold") for entry in table.not_shown]
     return Group(*parts)
-
-
-def _sorted(rows: list[RowSummary], metric: str | None) -> list[RowSummary]:
-    """Return the rows, each division from the best to the worst; rows without a value come last."""
-    if metric is None:
-        return rows
-    sign = -1 if METRICS[metric].higher_is_better is False else 1
-
-    def place(row: RowSummary) -> tuple[bool, float]:
-        value = row.estimates[metric].value
-        return value is None, 0.0 if value is None else -sign * value
-
-    return [row for members in divisions_of(rows).values() for row in sorted(members, key=place)]
 
 
 def _fitted(

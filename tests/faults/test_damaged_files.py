@@ -230,7 +230,7 @@ def _told(board: Path) -> tuple[Any, Any]:
     """Return the kept numbers of a board and what the verification of its record found, None if refused."""
     (record,) = (board / "records").glob("*/*/*.json")
     kept = publishing.read_unchanged(board / "records", publishing.inputs_of(board / "records"))
-    return kept and kept.to_json(), tiers.verification_notes(record) or None
+    return kept and kept.to_json(), tiers.verification_of(record).notes or None
 
 
 @pytest.mark.long

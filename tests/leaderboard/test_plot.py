@@ -150,6 +150,24 @@ def test_a_frontier_shows_the_methods_of_the_ladder(record: Callable[..., Record
         plot.frontier(tmp_path / "records", "clbench/Toy-v1")
 
 
+def test_a_frontier_leaves_out_runs_that_cannot_be_compared_with_the_board(
+    record: Callable[..., Record], tmp_path: Path
+) -> None:
+    for scenario, rollouts in (("clbench/Toy-v0", "1234"), ("clbench/Other-v0", "4567")):
+        of_board = record(scenario=scenario)
+        of_board.fingerprint["rollouts"] = {"toy:world": rollouts}
+        write_record(of_board, record_path(tmp_path / "records", scenario, "sft", 0))
+        for factor in (1.0, 0.3):
+            changes = {"step_factor": factor}
+            one = record(scenario=scenario, changes=changes, settings=changes)
+            one.fingerprint["rollouts"] = {"toy:world": "1234"}
+            name = f"sft+step_factor={factor}"
+            write_record(one, record_path(tmp_path / "ladder", scenario, name, 0))
+    assert ">sft</text>" in plot.frontier(tmp_path / "records").svg()
+    with pytest.raises(UnknownNameError, match="No scenario with a curve is called 'clbench/Other-v0'"):
+        plot.frontier(tmp_path / "records", "clbench/Other-v0")
+
+
 def test_a_chart_is_saved_as_the_ending_says(record: Callable[..., Record], tmp_path: Path) -> None:
     chart = plot.matrix(record())
     begins = {"svg": b"<svg", "png": b"\x89PNG", "PDF": b"%PDF"}

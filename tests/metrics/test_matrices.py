@@ -279,6 +279,21 @@ def test_a_reason_names_the_missing_cells_of_a_reference() -> None:
     assert report.of("gain", "sft").reason == "The table lacks stage 3, task 1."
 
 
+def test_a_method_with_one_seed_is_compared_with_that_seed_of_the_reference() -> None:
+    sft = np.array([[[0.4, 0.0], [0.2, 0.4]], [[0.9, 0.0], [0.9, 0.9]]])
+    report = from_matrix({"sft": sft, "a": sft[:1] + 0.1, "b": sft[0] + 0.1})
+    assert report.of("gain", "a").value == pytest.approx(0.1)
+    assert report.of("gain", "b").reason == "Method sft has no matrix without a seed."
+    report = from_matrix({"sft": sft[0], "a": sft[:1] + 0.1})
+    assert report.of("gain", "a").value == pytest.approx(0.1)
+
+
+def test_two_names_that_read_alike_are_refused() -> None:
+    one, other = [[0.5]], [[0.6]]
+    with pytest.raises(InputError, match="Two methods are called '1': rename one"):
+        from_matrix({1: one, "1": other})  # type: ignore[dict-item]
+
+
 def test_a_reason_counts_no_cells_of_a_seed_that_only_the_reference_has() -> None:
     holed = np.array(JOINT)
     holed[3, 0] = np.nan

@@ -12,8 +12,8 @@ from clbench.scoring.expected_precision import half_width
 from clbench.scoring.intervals import (
     NO_ESTIMATE,
     Estimate,
-    bootstrap,
     estimate,
+    estimate_quantity,
     paired_difference,
     row_generator,
 )
@@ -299,7 +299,7 @@ def test_methods_with_other_numbers_of_runs_are_not_compared() -> None:
         with pytest.raises(
             InputError, match="runs of the same seeds, in the same order, and at least one run"
         ):
-            bootstrap(
+            estimate_quantity(
                 lambda rates: rates["one"].success.mean(axis=(-1, -2, -3)),
                 {"one": first, "two": second},
                 np.random.default_rng(0),
@@ -437,7 +437,7 @@ def test_a_bootstrap_of_any_quantity_gives_a_difference_of_metrics_its_interval(
     generator, shape = np.random.default_rng(5), layout(3, 8, targets=2, points=3)
     ours, theirs = ([random_run(generator, shape) for _ in range(3)] for _ in range(2))
     retention = load_metric("retention").over_runs
-    got = bootstrap(
+    got = estimate_quantity(
         lambda rates: retention(rates["ours"]) - retention(rates["theirs"]),
         {"ours": ours, "theirs": theirs},
         np.random.default_rng(1),

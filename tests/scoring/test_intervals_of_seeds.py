@@ -11,8 +11,8 @@ from clbench.records.record import Relearning
 from clbench.scoring.intervals import (
     NO_ESTIMATE,
     Estimate,
-    bootstrap,
     estimate,
+    estimate_quantity,
     interval,
     interval_of_seeds,
     mean_of_seeds,
@@ -177,7 +177,7 @@ def test_seeds_that_agree_on_what_no_episode_draws_have_no_interval_of_it(
     found = estimate(WHOLE, runs, np.random.default_rng(0), replicates=20)
     assert {name: one.value for name, one in found.items()} == pytest.approx(WHOLE)
     assert {(one.low, one.high) for one in found.values()} == {(None, None)}
-    answers = bootstrap(
+    answers = estimate_quantity(
         lambda rates: rates["one"].answer_curves[..., 0, 0].mean(axis=-1),
         {"one": list(runs.values())},
         np.random.default_rng(0),

@@ -22,7 +22,8 @@ def test_an_unknown_metric_is_a_lookup_error_that_names_the_nearest() -> None:
 def test_a_metric_is_found_by_its_title_on_the_board() -> None:
     assert load_metric("learned") is METRICS["adaptation"]
     assert load_metric("kept skills") is load_metric("kept_skills") is METRICS["retention"]
-    assert load_metric("final average") is METRICS["final_average"]
+    assert load_metric("final average") is load_metric("Final-Average") is METRICS["final_average"]
+    assert load_metric("Learned") is METRICS["adaptation"]
 
 
 def test_a_value_is_ahead_only_if_it_is_better_by_more_than_the_last_bit() -> None:
@@ -38,7 +39,6 @@ def test_a_value_is_ahead_only_if_it_is_better_by_more_than_the_last_bit() -> No
     [
         ("acc", "performance_continual_world"),
         ("average_accuracy", "performance_continual_world"),
-        ("BWT", "backward_transfer"),
         ("AIA", "average_incremental_accuracy"),
         ("WC-ACC", "worst_case_accuracy"),
         ("min ACC", "minimum_accuracy"),
@@ -54,11 +54,11 @@ def test_a_metric_is_found_by_the_name_that_papers_use(usual: str, name: str) ->
     assert load_metric(usual) is METRICS[name]
 
 
-@pytest.mark.parametrize("usual", ["FWT", "NBT", "average forgetting"])
+@pytest.mark.parametrize("usual", ["BWT", "FWT", "NBT", "average forgetting"])
 def test_a_name_that_papers_use_for_several_metrics_lists_these_alone(usual: str) -> None:
     with pytest.raises(LookupError, match=f"'{usual}' has several definitions: ") as raised:
         load_metric(usual)
-    assert 2 <= sum(name in str(raised.value).replace(",", "").split() for name in METRICS) < 6
+    assert 2 <= len(METRICS.keys() & set(re.findall(r"\w+", str(raised.value)))) < 6
 
 
 def test_a_name_with_two_meanings_lists_both() -> None:

@@ -117,9 +117,11 @@ def test_the_share_of_right_answers_is_missing_where_a_kind_was_not_asked(make_r
     for step, kind, correct in ((100, "left", 9), (100, "above", 6), (200, "left", 8), (400, "above", 0)):
         append(record.answers, 1, step, kind, 10, correct)
     append(record.answers, 1, 400, "left", 10, 7)
+    append(record.answers, 2, 400, "left", 10, 6)
     run = Scores.from_record(record, partial=True)
     np.testing.assert_allclose(run.answer_curves, [[0.75, np.nan, np.nan, 0.35], [np.nan] * 4])
-    np.testing.assert_array_equal(run.correct, [[10, 10], [0, 7], [0, 0]])
+    np.testing.assert_allclose(run.rates().answered, [1.0, 0.35, np.nan])
+    np.testing.assert_array_equal(run.correct, [[10, 10], [0, 7], [0, 6]])
 
 
 def test_the_curve_of_answers_counts_the_questions_of_all_kinds_together(make_record: MakeRecord) -> None:

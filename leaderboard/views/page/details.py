@@ -15,10 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from clbench.base.text import printable
+from clbench.scoring.reading import is_number
 
 from ...board.commands import commands_of
 from ...board.rows import Row
-from ...board.runs import Run, is_number
+from ...board.runs import Run
 from ...board.summary import ELSEWHERE
 from ..format import number_text
 

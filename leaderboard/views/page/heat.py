@@ -11,8 +11,8 @@ from clbench.spec.policies import DEFAULT_POLICY
 
 from ...board.rows import Row
 from ...board.summary import DIVISIONS, RANKED_BY, competing
+from ..charts.vega import finite
 from ..format import Column, column_title
-from .charts.vega import finite
 from .numbers import MISSING, Number, number
 
 COLUMNS = tuple(

@@ -23,16 +23,16 @@ from ...board.rows import Board
 from ...board.summary import DIVISIONS
 from ...board.tiers import TIERS
 from ...policies.compared import Comparisons
+from ..charts.along import SERIES, along_a_run
+from ..charts.axes import ACROSS, UP
+from ..charts.decoders import decoders
+from ..charts.frontier import NARROW as NARROW_FRONTIER
+from ..charts.frontier import WIDE as WIDE_FRONTIER
+from ..charts.frontier import frontier
+from ..charts.picture import VEGA_LITE, in_both_themes
+from ..charts.plane import FULL, NARROW, WIDE, Plane, plane, template
+from ..charts.vega import FONT, PALETTE, SHAPES
 from ..format import column_title, format_interval, number_text, title_of
-from .charts.along import SERIES, along_a_run
-from .charts.axes import ACROSS, UP
-from .charts.decoders import decoders
-from .charts.frontier import NARROW as NARROW_FRONTIER
-from .charts.frontier import WIDE as WIDE_FRONTIER
-from .charts.frontier import frontier
-from .charts.picture import VEGA_LITE, in_both_themes
-from .charts.plane import FULL, NARROW, WIDE, Plane, plane, template
-from .charts.vega import FONT, PALETTE, SHAPES
 from .heat import COLUMNS, heat_maps
 from .numbers import MISSING
 from .rows import MAIN

@@ -19,6 +19,8 @@ from clbench.spec.identifiers import built_in_methods
 
 from ...board.rows import Row, standing_of
 from ...board.summary import DIVISIONS, ELSEWHERE, RANKED_BY, letters_of
+from ..charts.curves import estimated, retained_curve, target_curves
+from ..charts.vega import finite, rounded
 from ..descriptions import Description, describe
 from ..format import (
     NAMED,
@@ -34,8 +36,6 @@ from ..format import (
     title_of,
 )
 from ..templating import arxiv_ids
-from .charts.vega import finite, rounded
-from .curves import estimated, retained_curve, target_curves
 from .details import Diagnostics, Entry, commands, diagnostics, flat, same_or_each
 from .numbers import MISSING, Number, cost, number, size, tried
 

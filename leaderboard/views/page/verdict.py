@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from clbench.base.text import counted, listed, printable
 from clbench.scoring.groups import groups
 from clbench.scoring.intervals import Estimate
+from clbench.scoring.metric import TIE
 from clbench.spec.references import BASELINE
 
+from ...board.certainty import TiedGain, sides_of_gains
 from ...board.costs import mean_step_ratio
-from ...board.frontier import TiedGain
-from ...board.rows import Row, apart_from_baseline, certain_sides, mean_difference, standing_of
+from ...board.rows import Row, mean_difference, standing_of
 from ...board.summary import (
     DIVISIONS,
     METHODS,
@@ -73,15 +74,10 @@ def headline(rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]] | None 
     if not others:
         value = number_text(baseline.estimates[RANKED_BY].value, ".2f", MISSING)
         return f"Plain fine-tuning ends with a final average of {value}. No other method has run here."
-    apart = apart_from_baseline(rows)
-    gains = {
-        row.method: mean_difference(RANKED_BY, row.scores, baseline.scores) or 0.0
-        for row in others
-        if row.method in apart
-    }
-    sides = certain_sides(rows, tied or {})
+    sides = sides_of_gains(rows, tied or {})
     ahead = [row for row in others if sides.get(row.method) == 1]
-    if not apart and all(len(row.seeds) == 1 for row in members):
+    gains = {row.method: mean_difference(RANKED_BY, row.scores, baseline.scores) or 0.0 for row in ahead}
+    if not sides and all(len(row.seeds) == 1 for row in members):
         methods = "the only other method cannot" if len(others) == 1 else "no method can"
         return (
             f"With one seed, {methods} be told apart from plain fine-tuning: the intervals cover only the "
@@ -126,7 +122,7 @@ def verdicts(rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]] | None 
         rows: The rows.
         tied: As for `headline`.
     """
-    apart = apart_from_baseline(rows)
+    apart = sides_of_gains(rows, tied or {})
     found = []
     baseline = next((row for row in rows if row.method == BASELINE), None)
     for division, members in divisions_of(rows).items():
@@ -149,12 +145,12 @@ def verdicts(rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]] | None 
     return found
 
 
-def _standing(leader: Row, rows: Iterable[Row]) -> str:
+def _standing(leader: Row, rows: Sequence[Row]) -> str:
     standing = standing_of(leader, rows)
     value = number_text(leader.estimates[RANKED_BY].value, ".2f")
     if standing is None or standing.count == 1:
         return f"It is alone in its division, with a final average of {value}."
-    first = f"It ranks first of {standing.count} in final average ({value})"
+    first = f"It ranks first of {standing.count} {_ranked_in(leader, rows)} ({value})"
     if len(standing.alike) == 1:
         return f"{first}; {_names(standing.alike)} is not told apart from it."
     if standing.alike:
@@ -163,6 +159,14 @@ def _standing(leader: Row, rows: Iterable[Row]) -> str:
     if len(others) == 1:
         return f"{first}, told apart from {printable(others[0].method)}."
     return f"{first}, told apart from all others of its division."
+
+
+def _ranked_in(leader: Row, rows: Iterable[Row]) -> str:
+    """Return in words what a leader is first in: another row may have luckier seeds, see `Row.height`."""
+    finals = [row.estimates[RANKED_BY].value or 0.0 for row in rows if row.division == leader.division]
+    if (leader.estimates[RANKED_BY].value or 0.0) > max(finals) - TIE:
+        return "in final average"
+    return f"over the seeds that each shares with {BASELINE}, but not in final average"
 
 
 def _doubt(leader: Row, rows: Sequence[Row], apart: Container[str], tied: Sequence[TiedGain]) -> str:

@@ -12,7 +12,8 @@ from clbench.scoring.metric import TIE, Metric
 from clbench.spec.policies import DEFAULT_POLICY, POLICIES, is_built_in, kind_of, size_of
 from clbench.spec.references import BASELINE
 
-from ...board.frontier import Curve, TiedGain
+from ...board.certainty import TiedGain
+from ...board.frontier import Curve
 from ...board.paths import SCENARIO
 from ...board.rows import Board, Row
 from ...board.summary import (
@@ -75,6 +76,8 @@ class ScenarioView:
     """Sentence on rows that began with another pretrained policy than sft, empty if none did."""
     agreement: str
     """Sentence on how alike the seeds order the methods, empty if it is not known."""
+    prediction: str
+    """Sentence on what predicts forgetting among the methods, empty if nothing is known."""
     comparisons: tuple[Comparison, ...]
     """The same methods with the default policy; none for a table of that policy."""
     decoding: Decoding | None
@@ -165,11 +168,6 @@ class ScenarioView:
         """Whether its stages end when the target is learned."""
         return self.rows[0].row.to_criterion
 
-    @cached_property
-    def prediction(self) -> str:
-        """Sentence on what predicts forgetting among the methods, empty if nothing is known."""
-        return prediction_text(self.table)
-
     @property
     def others(self) -> list[Metric]:
         """Metrics that its table does not show."""
@@ -248,6 +246,7 @@ def scenarios(tables: Mapping[str, list[Row]], board: Board, comparisons: Compar
                 machine=machine_text(board.machines.get(scenario)),
                 unpaired=unpaired_text(board.unpaired.get(scenario)),
                 agreement=agreement_text(board.agreements.get(scenario)),
+                prediction=prediction_text(board.predictions.get(scenario, ())),
                 comparisons=comparisons.get(scenario, ()),
                 decoding=decoding if decoding and scenario == decoding.table else None,
             )

@@ -15,7 +15,7 @@ run_command = resolve("clbench.leaderboard.board.commands:run_command")
 def _run(seed: int, *, device: str = "cpu", perturb: bool = False, table: str = "clbench/Toy-v0") -> Any:
     """Return a run, as far as commands read it."""
     info = SimpleNamespace(device=device, perturb=perturb)
-    return SimpleNamespace(table=table, method="lora", seed=seed, record=SimpleNamespace(run=info))
+    return SimpleNamespace(table=table, label="lora", seed=seed, record=SimpleNamespace(run=info))
 
 
 def _seeds(command: str) -> set[int]:

@@ -1,4 +1,4 @@
-"""The ladder of learning rates: its curves, and gains over settings that tuning rated as highly."""
+"""The ladder of learning rates: its curves."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -10,27 +10,13 @@ from clbench.records.paths import label_of, record_path
 from clbench.records.reader import read_record
 from clbench.records.record import Record
 from clbench.records.writer import write_record
-from clbench.runs.tuning import Tried, Tuned
-from clbench.scoring.intervals import Estimate
 
 SCENARIO = "clbench/Even-v1"
 MODULE = "clbench.leaderboard.board.frontier"
-TiedGain = resolve(f"{MODULE}:TiedGain")
-side_of_zero = resolve(f"{MODULE}:side_of_zero")
-frontiers_of, ladder_of, read_ladder, tied_gains = (
-    resolve(f"{MODULE}:{name}") for name in ("frontiers_of", "ladder_of", "read_ladder", "tied_gains")
+frontiers_of, ladder_of, read_ladder = (
+    resolve(f"{MODULE}:{name}") for name in ("frontiers_of", "ladder_of", "read_ladder")
 )
 compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
-read_run = resolve("clbench.leaderboard.board.runs:read_run")
-
-
-@pytest.fixture
-def _tuned(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let tuning have rated plain fine-tuning alike at 0.1, which it chose, and at 0.3."""
-    scores = {1.0: 0.4, 0.1: 0.6, 0.3: 0.6, 0.03: 0.5}
-    tried = tuple(Tried({"step_factor": factor}, final, 0.9) for factor, final in scores.items())
-    found = {"sft": Tuned({"step_factor": 0.1}, tried)}
-    monkeypatch.setattr(f"{MODULE}.tuned", lambda name: found if name == SCENARIO else {})
 
 
 def test_the_ladder_lies_beside_the_records_as_they_are_named(
@@ -42,50 +28,6 @@ def test_the_ladder_lies_beside_the_records_as_they_are_named(
     assert ladder_of(tmp_path / "board" / "records") == tmp_path / "board" / "ladder"
     monkeypatch.chdir(tmp_path / "board" / "records")
     assert ladder_of(Path("../board/records")) == tmp_path / "board" / "ladder"
-
-
-@pytest.mark.usefixtures("_tuned")
-def test_a_gain_over_a_tied_setting_is_that_over_plain_fine_tuning_there_on_common_seeds(
-    even_board: Callable[..., Path],
-) -> None:
-    for seed, kept in enumerate((0.6, 0.6, 0.7, 0.9)):
-        records = even_board("lora", seed, kept)
-    for seed, kept in enumerate((0.2, 0.2, 0.5)):
-        even_board("sft", seed, kept, "ladder", step_factor=0.3)
-        even_board("sft", seed, 0.0, "ladder", step_factor=0.1)  # tuning's choice is on the board already
-        even_board("stop_gradient", seed, 0.9, "ladder", step_factor=0.3)
-    runs = [read_run(records, path) for path in sorted(records.rglob("seed-*.json"))]
-    ladder, _ = read_ladder(ladder_of(records))
-    (one,) = tied_gains(SCENARIO, {"lora": {run.seed: run.scores for run in runs}}, ladder)["lora"]
-    assert (one.factor, one.seeds) == (0.3, 3)
-    # the final average has three tasks that are kept, and the last target, which all learn alike
-    differences = [3 / 4 * (0.6 - 0.2), 3 / 4 * (0.6 - 0.2), 3 / 4 * (0.7 - 0.5)]
-    assert one.gain.value == pytest.approx(sum(differences) / 3)
-    assert one.gain.low < one.gain.value < one.gain.high
-
-
-@pytest.mark.usefixtures("_tuned")
-def test_a_tied_setting_without_runs_shows_no_gain_that_would_be_certain(
-    even_board: Callable[..., Path],
-) -> None:
-    for seed in range(2):
-        even_board("sft", seed, 0.1)
-        even_board("frozen", seed, 0.9)  # a reference, which does not compete
-        records = even_board("lora", seed, 0.9)
-    tied = compute_board(records).tied[SCENARIO]
-    assert set(tied) == {"lora", "sft"}
-    (one,) = tied["lora"]
-    assert (one.factor, one.seeds, one.gain.value, one.is_certain) == (0.3, 0, None, False)
-
-
-def test_a_gain_or_a_loss_is_certain_over_all_tied_settings_or_over_none() -> None:
-    gain, loss, neither = (Estimate(middle, middle - 0.01, middle + 0.01) for middle in (0.02, -0.02, 0.005))
-    up, down, unsure = (TiedGain(0.3, one, 4) for one in (gain, loss, neither))
-    assert [side_of_zero(one, []) for one in (gain, loss, neither)] == [1, -1, 0]
-    assert side_of_zero(gain, [up, up]) == 1
-    assert side_of_zero(loss, [down]) == -1
-    assert [side_of_zero(gain, tied) for tied in ([up, unsure], [unsure, up], [down])] == [0, 0, 0]
-    assert [side_of_zero(loss, tied) for tied in ([unsure], [up])] == [0, 0]
 
 
 def test_curves_of_a_method_with_other_settings_are_named_by_these(even_board: Callable[..., Path]) -> None:

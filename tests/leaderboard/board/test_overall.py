@@ -63,6 +63,25 @@ def test_a_missing_value_leaves_no_mean_and_a_missing_interval_leaves_the_mean_a
     assert (found.value, found.low, found.high) == (pytest.approx(0.3), None, None)
 
 
+def test_the_mean_of_ratios_is_geometric_and_so_is_its_interval() -> None:
+    parts = [Estimate(2.0, 1.0, 4.0), Estimate(0.5, 0.25, 1.0)]
+    found = mean_estimate(parts, ratio=True)
+    reach = 2 ** math.sqrt(0.5)  # each interval ends a factor of 2 away
+    assert (found.value, found.low, found.high) == pytest.approx((1.0, 1 / reach, reach))
+    assert mean_estimate([*parts, Estimate(0.0, None, None)], ratio=True).value == pytest.approx(2.5 / 3)
+    names = "clbench/One-v0", "clbench/Two-v0"
+    pairs = zip(names, (2.0, 0.5), strict=True)
+    (row,) = overall([_row(name, "sft", ratio, seeds=(0, 1)) for name, ratio in pairs])
+    assert row.estimates["speed"].value == pytest.approx(1.0)
+    assert row.estimates["kept"].value == pytest.approx(1.25)
+
+
+def test_a_mean_over_a_scenario_with_one_seed_says_nothing_about_other_seeds() -> None:
+    of_seeds, of_episodes = Estimate(0.4, 0.3, 0.5), Estimate(0.4, 0.3, 0.5, of_seeds=False)
+    assert mean_estimate([of_seeds, of_seeds]).of_seeds
+    assert not mean_estimate([of_seeds, of_episodes]).of_seeds
+
+
 def test_only_methods_with_a_row_in_every_scenario_are_listed_the_best_first() -> None:
     names = one, two, three = "clbench/One-v0", "clbench/Two-v0", "clbench/Three-v0"
     finals = {"good": (0.8, 0.4, 0.6), "missing": (0.9, None, 0.9), "better": (0.8, 0.6, 0.7)}

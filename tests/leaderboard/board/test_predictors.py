@@ -1,5 +1,7 @@
 """Predictors of forgetting, on made-up values and on boards of made-up records."""
 
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -7,10 +9,15 @@ import pytest
 from scipy.stats import kendalltau
 
 from clbench.base.entry_points import resolve
+from clbench.records.paths import record_path
+from clbench.records.record import Record
+from clbench.records.writer import write_record
 
-chance_among_equals = resolve("clbench.leaderboard.board.predictors:chance_among_equals")
-prediction_of = resolve("clbench.leaderboard.board.predictors:prediction_of")
-predictions = resolve("clbench.leaderboard.board.predictors:predictions")
+chance_among_equals = resolve("clbench.leaderboard.board.agreement:chance_among_equals")
+compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
+markdown = resolve("clbench.leaderboard.views.markdown:markdown")
+prediction_of = resolve("clbench.leaderboard.board.agreement:prediction_of")
+predictions = resolve("clbench.leaderboard.board.rows:predictions")
 
 
 def test_tau_is_that_of_the_means_over_seeds_by_scipy() -> None:
@@ -151,3 +158,21 @@ def test_few_rows_and_rows_of_equal_stages_have_no_prediction(rows: list[_Row]) 
 def test_a_row_without_a_seed_of_the_baseline_is_left_out(rows: list[_Row]) -> None:
     rows[1].seeds = (0,)
     assert {one.rows for one in predictions(rows)} == {6}
+
+
+def test_a_board_has_the_predictions_of_its_scenarios_and_the_page_writes_them(
+    make_record: Callable[..., Record], tmp_path: Path
+) -> None:
+    for number, method in enumerate(["sft", "ewc", "lora", "aegis", "lwf", "finch"]):
+        left = 1 - 0.1 * number
+        matrix = [[1, 1, 0, 0, 0], [left, left, 1, 0, 0], [left, left, left, 1, 0]]
+        for seed in range(4):
+            moved = {"sparsity": np.full((2, 1), 0.5), "drift": np.full((2, 1), number + 0.1 * seed)}
+            options = {"groups": (2, 2, 1), "steps": (100,), "ends": (8, 12), **moved}
+            record = make_record(matrix, method=method, seed=seed, **options)
+            write_record(record, record_path(tmp_path / "records", record.run.scenario, method, seed))
+    board = compute_board(tmp_path / "records")
+    (found,) = board.predictions.values()
+    assert list(found) == predictions(board.rows)
+    assert [(one.predictor, one.tau, one.rows) for one in found] == [("activation drift", 1.0, 6)]
+    assert "a stage: activation drift 1.00, 1.00 to 1.00 with redrawn seeds" in markdown(board, {})

@@ -12,10 +12,8 @@ from helpers import complete_record, set_in
 from clbench.base.entry_points import resolve
 from clbench.records.record import Record
 from clbench.records.writer import record_text
-from clbench.scoring.groups import groups
 
 agreement = resolve("clbench.leaderboard.board.rows:agreement")
-apart_from_baseline = resolve("clbench.leaderboard.board.rows:apart_from_baseline")
 compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 costs_of = resolve("clbench.leaderboard.board.costs:costs_of")
 division_of = resolve("clbench.leaderboard.board.runs:division_of")
@@ -181,46 +179,6 @@ def test_only_seeds_with_orders_of_their_own_have_an_agreement(scores: Callable[
     for row in made:
         row.runs[0].published.balanced = False
     assert agreement(made) is None
-
-
-def test_a_method_is_not_tested_together_with_those_that_may_look_at_more(
-    scores: Callable[..., Any],
-) -> None:
-    def some(rate: float) -> dict[int, Any]:
-        return dict.fromkeys(range(8), scores(np.full((2, 5), rate), groups=(3, 1, 1), episodes=10))
-
-    # one episode of ten: 0.1 with a standard error of 0.1 / sqrt(8), 2.8 times. Tukey's factor for 2 rows of
-    # 8 seeds is 2.36, and for 10 rows 3.28
-    sft, lora = _row("sft", some(0.4)), _row("lora", some(0.5))
-    others = [_row(f"method_{number}", some(0.4)) for number in range(8)]
-    assert apart_from_baseline([sft, lora]) == {"lora"}
-    assert apart_from_baseline([sft, lora, *others]) == set()
-    for row in others:
-        row.division = "prior demonstrations"
-    assert apart_from_baseline([sft, lora, *others]) == {"lora"}
-
-
-def test_a_method_that_shares_a_letter_with_plain_fine_tuning_is_not_apart_from_it(
-    scores: Callable[..., Any],
-) -> None:
-    # the row between the others is like both, which are not like each other
-    successes = {"high": (8, 7, 9, 8), "sft": (6, 7, 6, 7), "low": (5, 4, 5, 6)}
-    rows = [
-        _row(
-            name,
-            {
-                seed: scores(np.full((2, 5), count / 10), groups=(3, 1, 1), episodes=10)
-                for seed, count in enumerate(counts)
-            },
-        )
-        for name, counts in successes.items()
-    ]
-    assert groups("final_average", {row.method: row.scores for row in rows}) == {
-        "high": "a",
-        "sft": "ab",
-        "low": "b",
-    }
-    assert apart_from_baseline(rows) == set()
 
 
 @pytest.mark.parametrize(

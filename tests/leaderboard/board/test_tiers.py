@@ -11,7 +11,7 @@ from clbench.base.entry_points import resolve
 
 compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 TIERS = "clbench.leaderboard.board.tiers"
-tier_of, checks_of = resolve(f"{TIERS}:tier_of"), resolve(f"{TIERS}:checks_of")
+verification_of = resolve(f"{TIERS}:verification_of")
 verification_path, verification_text = (
     resolve(f"{TIERS}:{name}") for name in ("verification_path", "verification_text")
 )
@@ -46,5 +46,6 @@ def test_a_verification_whose_checks_are_no_list_counts_as_none(
     values = {"tier": "replayed", "record": hashlib.sha256(record.read_bytes()).hexdigest()}
     for found, tier in (([], "replayed"), (checks, "self-reported")):
         verification_path(record).write_text(verification_text({**values, "checks": found}), encoding="utf-8")
-        assert tier_of(record) == tier
-        assert checks_of(record) == []
+        verification = verification_of(record)
+        assert verification.tier == tier
+        assert verification.notes == ((("tier", "replayed"),) if tier == "replayed" else ())

@@ -19,13 +19,14 @@ from clbench.testing import TOY
 figures = {
     name: resolve(f"clbench.leaderboard.claims.figures:{name}")
     for name in (
+        "anchor_distance",
         "drift_ratio",
         "early_success",
-        "kept",
         "learning_curve",
         "median_stage",
         "perturbation_gain",
         "perturbation_loss",
+        "retention_difference",
         "share_afterwards",
         "share_between",
         "share_of_steps",
@@ -56,6 +57,26 @@ def test_the_ratio_of_steps_is_a_geometric_mean_in_which_no_step_counts_as_one(b
     ratios = [(2 / 4) * (8 / 8), (1 / 6) * (8 / 8), (1 / 4) * (8 / 8)]
     assert found.value == pytest.approx(np.prod(ratios) ** (1 / 6))  # two targets, three seeds
     assert figures["median_stage"](evidence, "sft").value == 7  # of 4, 4, 6, 8, 8 and 8
+
+
+def test_stages_of_a_fixed_length_have_no_median_of_the_steps_to_the_criterion(bench: Bench) -> None:
+    bench.add("sft")
+    found = figures["median_stage"](bench.evidence(), "sft")
+    assert (found.estimate.value, found.note) == (None, "not in these records")
+    absent = figures["median_stage"](bench.evidence(), "lora")
+    assert (absent.estimate.value, absent.missing) == (None, ("lora",))
+
+
+def test_the_distance_to_the_anchor_is_that_of_the_first_stage_and_of_no_other(bench: Bench) -> None:
+    distances = {"anchor_distance": [100.0, 25.0]}  # they are squared
+    bench.add("aegis", diagnostics={"1": distances, "2": {"anchor_distance": [9.0, 1.0]}})
+    bench.add("lora", diagnostics={"2": distances})
+    bench.add("consft", diagnostics={"1": None, "2": distances})
+    evidence = bench.evidence()
+    for end, distance in (("before the first step", 10.0), ("at the end of the first stage", 5.0)):
+        assert figures["anchor_distance"](evidence, "aegis", end).value == distance
+        for method in ("lora", "consft"):
+            assert figures["anchor_distance"](evidence, method, end).estimate.value is None
 
 
 def test_the_share_of_weights_leaves_out_both_ends_and_the_last_tenth(bench: Bench) -> None:
@@ -153,7 +174,7 @@ def test_a_note_tells_the_settings_in_which_methods_differ(bench: Bench) -> None
     settings = {"replay": 0.9, "step_factor": 0.3, "other": 5}, {"tau_start": 0.03, "loss_scale": 0.01}
     for method, values in zip(("stranger", "other"), settings, strict=True):
         bench.add(method, edit=set_in("run", "settings", values))
-    found = figures["kept"](bench.evidence(), "stranger", "other")
+    found = figures["retention_difference"](bench.evidence(), "stranger", "other")
     assert found.note == "stranger: replay 0.9, step_factor 0.3; other: tau_start 0.03, loss_scale 0.01"
 
 

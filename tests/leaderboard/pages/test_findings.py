@@ -99,8 +99,7 @@ def test_the_ladder_tells_what_a_smaller_learning_rate_does(
         for seed in range(4):
             even_board("sft", seed, kept, "ladder", step_factor=factor)
     text = page()
-    factor = "at 0.1 times the scenario's learning rate keeps 0.30 ["
-    assert f"On Even-v1, plain fine-tuning {factor}" in text
+    assert "On Even-v1, plain fine-tuning at 0.1 times the scenario's learning rate keeps 0.30 [" in text
     assert "which is not certain" not in text
     assert re.search(r"\| plain fine-tuning at the largest rate \| 0\.20 \[.*?\] at factor 1 \|", text)
     assert re.search(
@@ -152,7 +151,7 @@ def test_a_gain_that_is_not_certain_over_a_tied_setting_is_no_yes(
     tuning = resolve("clbench.runs.tuning:Tuned"), resolve("clbench.runs.tuning:Tried")
     tried = tuple(tuning[1]({"step_factor": factor}, 0.5, 0.9) for factor in (1.0, 0.1))
     found = {"sft": tuning[0]({"step_factor": 1.0}, tried)}
-    monkeypatch.setattr("clbench.leaderboard.board.frontier.tuned", lambda scenario: found)
+    monkeypatch.setattr("clbench.leaderboard.board.certainty.tuned", lambda scenario: found)
     fill(even_board, sft=0.4, finch=0.8, lora=0.4)
     for seed in range(4):
         even_board("sft", seed, 0.8, "ladder", step_factor=0.1)
@@ -259,9 +258,9 @@ def test_how_fast_lost_skills_come_back_is_told_with_their_names(
             write_record(record, record_path(tmp_path / "records", "clbench/Even-v1", method, seed))
     text = page()
     assert "- Plain fine-tuning loses a skill in 2 of 2 seeds on Even-v1.\n" in text
-    _, skills, steps, never, unpretrained = cells_of(text, "| Even-v1 | `skill_1`")
+    _, skills, took, never, unpretrained = cells_of(text, "| Even-v1 | `skill_1`")
     assert (skills, never) == ("`skill_1` in 2", "0 of 2 seeds")
-    assert steps.startswith("10 [")
+    assert took.startswith("10 [")
     # another skill says nothing of this one
     assert unpretrained == ("20 (`skill_1` in 2)" if other == "skill_1" else "-")
 

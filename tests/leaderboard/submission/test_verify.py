@@ -5,6 +5,7 @@ import importlib
 import json
 import math
 import shutil
+import sys
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from verification import TOY, edit, failures, flip, verify
 import clbench
 from clbench.cli.main import app
 from clbench.learning.pretraining import pretrained_policy
-from clbench.records.paths import record_path
+from clbench.records.paths import label_of, record_path
 from clbench.records.reader import read_record
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
@@ -300,16 +301,19 @@ def test_a_record_that_is_named_twice_is_verified_once(
     assert len(json.loads(capsys.readouterr().out)) == 1
 
 
+@pytest.mark.parametrize("changes", [{}, {"step_factor": 0.3}])
 def test_a_module_that_a_record_names_is_not_imported_unless_the_verifier_allows_it(
-    mine: Path, honest: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    changes: dict[str, float], mine: Path, honest: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trace = f"import pathlib\npathlib.Path({str(tmp_path / 'ran')!r}).touch()\n"
     (tmp_path / "stranger.py").write_text(f"{trace}class Mine: pass\n")
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "stranger", raising=False)
     record = read_record(mine)
-    place = record_path(mine.parents[2], "clbench/Toy-v0", "stranger:Mine", 0)
+    place = record_path(mine.parents[2], "clbench/Toy-v0", label_of("stranger:Mine", changes), 0)
     place.parent.mkdir()
-    run = {**vars(record.run), "method": "stranger:Mine"}
+    settings = {**record.run.settings, **changes}
+    run = {**vars(record.run), "method": "stranger:Mine", "settings": settings, "changes": changes}
     values = {**json.loads(mine.read_text(encoding="utf-8")), "run": run}
     place.write_text(json.dumps(sealed(values)), encoding="utf-8")
     checks = verify(place, "replayed", honest)

@@ -8,8 +8,11 @@ from typing import Any
 import pytest
 
 from clbench.base.entry_points import resolve
+from clbench.scoring.intervals import Estimate
 from clbench.scoring.scores import WEAK, WEAK_WARNING
 
+TiedGain = resolve("clbench.leaderboard.board.certainty:TiedGain")
+gain_text = resolve("clbench.leaderboard.views.format:gain_text")
 agreement_text = resolve("clbench.leaderboard.views.format:agreement_text")
 machine_text = resolve("clbench.leaderboard.views.format:machine_text")
 unpaired_text = resolve("clbench.leaderboard.views.format:unpaired_text")
@@ -104,3 +107,25 @@ def test_runs_that_did_not_begin_like_plain_fine_tuning_are_named_with_a_way_out
 def test_a_pretrained_policy_at_the_bar_is_not_weak() -> None:
     assert start_text(WEAK) == "The pretrained policy has a success rate of 0.80 on its skills."
     assert start_text(WEAK - 0.01).endswith(WEAK_WARNING)
+
+
+SURE, OPEN = Estimate(0.1, 0.05, 0.15), Estimate(0.1, -0.02, 0.22)
+
+
+@pytest.mark.parametrize(
+    ("gain", "tied", "certain"),
+    [
+        (SURE, (), True),
+        (OPEN, (), False),
+        (SURE, (SURE,), True),
+        (SURE, (SURE, OPEN), False),
+        (OPEN, (SURE,), False),
+    ],
+)
+def test_a_gain_is_certain_only_if_all_its_intervals_are_above_0(
+    gain: Estimate, tied: tuple[Estimate, ...], certain: bool
+) -> None:
+    text = gain_text("me/Mine-v0", "mine", gain, [TiedGain(0.1, one, 4) for one in tied])
+    assert text.startswith(f"On me/Mine-v0, the gain of mine is {'' if certain else 'not '}certain: it is ")
+    assert text.count("which scored the same in tuning (4 seeds)") == len(tied)
+    assert text.endswith(".")

@@ -19,7 +19,7 @@ PERTURBED = [[0.9, 0.8], [0.5, 0.7], [0.4, 0.2]]
 load = resolve("clbench:load_board")
 compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 markdown = resolve("clbench.leaderboard.views.markdown:markdown")
-TiedGain = resolve("clbench.leaderboard.board.frontier:TiedGain")
+TiedGain = resolve("clbench.leaderboard.board.certainty:TiedGain")
 
 
 def test_the_markdown_has_values_with_intervals_and_explains_them(

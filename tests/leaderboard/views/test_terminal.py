@@ -150,6 +150,53 @@ def test_the_rows_come_as_json_with_null_for_what_is_missing(
     assert not (four_methods.parent / "site").exists()
 
 
+def test_the_rows_of_one_scenario_as_json_are_sorted_too_with_the_reasons_of_its_other_records(
+    four_methods: Path,
+    add_full: Callable[..., Path],
+    matrix: Any,
+    even_board: Callable[..., Path],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    add_full("eager", 0, matrix * np.array([0.0, 0.0, 1.0, 1.0, 1.0]))
+    add_full("careful", 0, np.clip(matrix * np.array([1.0, 1.0, 0.5, 0.5, 1.0]), 0, 1))
+    add_full("odd", 0, edit=set_in("run", "changes", {"rate": 2}))
+    even_board("odd", 0, 0.5, "leaderboard/records", rate=2)
+    order = {}
+    for metric in ("adaptation", "retention"):
+        arguments = [
+            "leaderboard",
+            "clbench/Toy-v0",
+            "--json",
+            "--sort",
+            metric,
+            "--records",
+            str(four_methods),
+        ]
+        app(arguments, result_action="return_value")
+        printed = capsys.readouterr()
+        methods = [row["method"] for row in json.loads(printed.out)]
+        order[metric] = methods.index("careful") < methods.index("eager")
+        assert printed.err.startswith("Not shown: Toy-v0/odd/seed-0.json: ")
+        assert "Even-v1" not in printed.err
+    assert order == {"adaptation": False, "retention": True}
+
+
+def test_a_scenario_whose_records_are_all_refused_shows_why_and_not_what_to_run(
+    four_methods: Path, even_board: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    even_board("sft", 0, 0.5, "leaderboard/records")
+    for path in ((four_methods / "Even-v1/sft/seed-0.json"), (four_methods / "torn.json")):
+        path.write_text("{", encoding="utf-8")
+    with pytest.raises(SystemExit) as ended:
+        app(["leaderboard", "clbench/Even-v1", "--records", str(four_methods)])
+    assert ended.value.code == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "Not shown: Even-v1/sft/seed-0.json: cannot be read as JSON" in said
+    assert "makes a row of clbench/Even-v1. Scenarios with rows: clbench/Toy-v0." in said
+    assert "clbench run" not in said
+    assert "torn.json" not in said
+
+
 @pytest.mark.long
 def test_a_weak_pretrained_policy_is_named_on_every_form_of_the_board(
     four_methods: Path,

@@ -20,11 +20,11 @@ from clbench.scoring.scores import Scores
 from clbench.spec.references import BASELINE
 
 from ..format import format_interval
-from .charts.along import SERIES, along_a_run, with_points
-from .charts.matrix import matrix
-from .charts.plane import WIDE
-from .charts.vega import FONT, Spec, heading, rounded
+from .along import SERIES, along_a_run, with_points
 from .curves import estimated, retained_curve, target_curves
+from .matrix import matrix
+from .plane import WIDE
+from .vega import FONT, Spec, heading, rounded
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any, TypeAlias
 
-from ....board.frontier import Curve, Rung
-from ....board.summary import DIVISIONS, WITH_DEMONSTRATIONS
-from ...format import format_interval, number_text
+from ...board.frontier import Curve, Rung
+from ...board.summary import DIVISIONS, WITH_DEMONSTRATIONS
+from ..format import format_interval, number_text
 from .vega import SYSTEM_FONT, Size, Spec, axis, colour, heading, layer, rounded, specification, subtitle
 
 RATE_SHAPES = ("circle", "square", "triangle-up", "diamond", "cross", "triangle-down")

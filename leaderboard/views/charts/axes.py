@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from clbench.scoring.intervals import Estimate
 
-from ....board.summary import RowSummary, competing
-from ...format import bytes_text, format_interval, times_text
+from ...board.summary import RowSummary, competing
+from ..format import bytes_text, format_interval, times_text
 from .vega import Spec, finite, rounded
 
 ROOM = 0.02

@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from clbench.scoring.intervals import Estimate, draw_episodes, interval
+from clbench.scoring.intervals import Estimate, draw_episodes, mean_of_seeds
 from clbench.scoring.layout import Array, average
 from clbench.scoring.rates import Rates
 from clbench.scoring.scores import Scores
@@ -56,6 +56,4 @@ def estimated(
 
 def _estimate(values: Array, point: int, drawn: Callable[[], Array]) -> Estimate:
     """Return a point of a curve, given its value for each run and all points with redrawn episodes."""
-    count = len(values)
-    others = (values.sum() - values) / (count - 1) if count > 1 else np.zeros(0)
-    return interval(float(values.mean()), others, lambda: drawn()[:, point], (0.0, 1.0))
+    return mean_of_seeds(values.tolist(), (0.0, 1.0), lambda: drawn()[:, point])

@@ -11,9 +11,9 @@ import pytest
 from clbench.base.entry_points import resolve
 from clbench.scoring.intervals import Estimate
 
-Plane = resolve("clbench.leaderboard.views.page.charts.plane:Plane")
-PLANE = "clbench.leaderboard.views.page.charts.plane"
-AXES = "clbench.leaderboard.views.page.charts.axes"
+Plane = resolve("clbench.leaderboard.views.charts.plane:Plane")
+PLANE = "clbench.leaderboard.views.charts.plane"
+AXES = "clbench.leaderboard.views.charts.axes"
 learned, cost, bytes_kept = resolve(f"{AXES}:ACROSS")
 kept, skills, targets = resolve(f"{AXES}:UP")
 compute_board = resolve("clbench.leaderboard.board.rows:compute_board")

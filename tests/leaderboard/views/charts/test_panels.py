@@ -7,10 +7,10 @@ import pytest
 
 from clbench.base.entry_points import resolve
 
-FRONTIER = "clbench.leaderboard.views.page.charts.frontier"
+FRONTIER = "clbench.leaderboard.views.charts.frontier"
 frontier = resolve(f"{FRONTIER}:frontier")
 WIDE, NARROW = resolve(f"{FRONTIER}:WIDE"), resolve(f"{FRONTIER}:NARROW")
-on_paper = resolve("clbench.leaderboard.views.page.charts.picture:on_paper")
+on_paper = resolve("clbench.leaderboard.views.charts.picture:on_paper")
 Curve, Rung = (resolve(f"clbench.leaderboard.board.frontier:{name}") for name in ("Curve", "Rung"))
 Estimate = resolve("clbench.scoring.intervals:Estimate")
 

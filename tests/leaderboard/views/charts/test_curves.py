@@ -10,7 +10,7 @@ from scipy import stats
 from clbench.base.entry_points import resolve
 from clbench.scoring.intervals import interval_of_seeds
 
-MODULE = "clbench.leaderboard.views.page.curves"
+MODULE = "clbench.leaderboard.views.charts.curves"
 estimated, retained_curve, target_curves = (
     resolve(f"{MODULE}:{name}") for name in ("estimated", "retained_curve", "target_curves")
 )

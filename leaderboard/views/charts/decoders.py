@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from ....policies.decoders import Decoding
-from ...format import format_interval
+from ...policies.decoders import Decoding
+from ..format import format_interval
 from .vega import SYSTEM_FONT, Spec, colour, layer, rounded, specification
 
 

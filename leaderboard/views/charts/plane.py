@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from ....board.summary import DIVISIONS, RowSummary
+from ...board.summary import DIVISIONS, RowSummary
 from .axes import LEARNED, SKILLS, Axis, Quantity
 from .labels import LONGEST, Mark, place
 from .vega import FONT, SHAPES, SYSTEM_FONT, Size, Spec, colour, heading, layer, specification, subtitle
