@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -42,10 +43,10 @@ def whole_number(least: int, most: int | None = None) -> Parameter:
 
 def _whole_number(_: object, tokens: Sequence[Token]) -> int:
     """Return the number that a token spells; cyclopts would round 1.5, and Python reads 1_0 as 10."""
-    try:
-        return int(tokens[0].value.replace("_", "-"))
-    except ValueError:
-        raise ValueError(f"it must be a whole number, not {tokens[0].value!r}") from None
+    text = tokens[0].value
+    if not re.fullmatch(r"[+-]?\d{1,99}", text):
+        raise ValueError(f"it must be a whole number, not {text!r}")
+    return int(text)
 
 
 Seed = Annotated[int, whole_number(0, LARGEST_SEED)]

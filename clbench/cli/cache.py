@@ -20,12 +20,11 @@ from rich.console import Console
 from rich.table import Table
 from safetensors import SafetensorError, safe_open
 
-from clbench.base.cache import MANIFEST, cache_folder, hash_of
+from clbench.base.cache import MANIFEST, cache_folder, hash_of, minari_folder
 from clbench.base.errors import InputError
 from clbench.base.leftovers import finished_name, is_idle, is_left_behind, is_unfinished, unfinished
 from clbench.base.text import counted, megabytes, print_plain
 from clbench.cli.arguments import checked_input, whole_number
-from clbench.jobs.folders import minari_folder
 from clbench.records.reader import RecordError, read_record
 
 LOG = logging.getLogger("clbench")
@@ -315,7 +314,7 @@ def _leftovers(kind: str, folder: Path) -> Iterator[Entry]:
         for name in sorted(folders):
             if not is_unfinished(name) or Path(place, name).is_symlink():
                 continue
-            if kind == DEMONSTRATIONS or _NAME.fullmatch([*above, finished_name(name)][0]):
+            if kind == DEMONSTRATIONS or _NAME.fullmatch(above[0] if above else finished_name(name)):
                 yield Entry(kind, Path(place, name))
 
 

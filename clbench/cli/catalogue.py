@@ -19,7 +19,7 @@ from rich.text import Text
 from clbench import __version__
 from clbench.base.errors import InputError
 from clbench.base.leftovers import replacing
-from clbench.base.text import megabytes, printable
+from clbench.base.text import megabytes, print_plain, printable
 from clbench.cli.arguments import AsJson, checked_input, checked_writing, print_json
 from clbench.records.tables import GROUPS
 
@@ -189,7 +189,7 @@ def doctor(*, as_json: AsJson = False) -> None:
     from clbench.learning.registry import method_names
 
     packages, machine = _packages(), _machine()
-    faults = [f"pip install '{one.requirement}'" for one in packages if one.is_wrong]
+    faults = [one.advice for one in packages if one.is_wrong]
     faults += [] if method_names() else ["pip install -e . in the checkout, as no method is installed"]
     if as_json:
         print_json(
@@ -221,7 +221,7 @@ def _print_doctor(packages: Sequence[_Package], machine: Mapping[str, str], faul
         table.add_row(name, escape(value))
     console.print(table)
     if faults:
-        console.print(f"clbench {__version__} cannot run here yet: {'; '.join(faults)}", style="bold red")
+        print_plain(console, f"clbench {__version__} cannot run here yet: {'; '.join(faults)}", "bold red")
     else:
         console.print(f"clbench {__version__} is ready.", style="bold green", highlight=False)
 
@@ -247,13 +247,22 @@ class _Package:
         return not self.fits and not self.extra
 
     @property
-    def verdict(self) -> str:
+    def is_left_out(self) -> bool:
+        """Whether it belongs to an extra, and is not installed."""
+        return bool(self.extra) and self.found is None
+
+    @property
+    def advice(self) -> str:
+        """The command that installs a version that fits."""
+        what = f"clbench[{self.extra}]" if self.is_left_out else self.requirement
+        return f"pip install '{what}'"
+
+    @property
+    def verdict(self) -> Text:
         """The last cell of its row."""
         if self.fits:
-            return "[green]fits[/]"
-        if self.found is None and self.extra:
-            return escape(f"pip install 'clbench[{self.extra}]'")
-        return f"[red]pip install '{escape(self.requirement.name)}{self.requirement.specifier}'[/]"
+            return Text("fits", "green")
+        return Text(self.advice, "" if self.is_left_out else "red")
 
 
 def _packages() -> list[_Package]:
@@ -280,8 +289,7 @@ def _machine() -> dict[str, str]:
     """Return what matters of this machine."""
     import torch
 
-    from clbench.base.cache import cache_folder
-    from clbench.jobs.folders import minari_folder
+    from clbench.base.cache import cache_folder, minari_folder
     from clbench.runs.fingerprint import arithmetic_hash
     from clbench.worlds.gl_backend import DEBIAN_PACKAGES, rendering_fault
     from clbench.worlds.threads import cores

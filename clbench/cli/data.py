@@ -199,39 +199,27 @@ def pretrain(
         workers: Number of tasks whose demonstrations are collected at once (default: all cores).
         ship: Copy the policy to clbench/pretrained/, so that it ships with the package. Needs a checkout.
     """
-    from clbench.jobs.bars import Bars
     from clbench.jobs.plan import Plan
-    from clbench.learning.pretraining import (
-        SHIPPED,
-        is_pretrained,
-        pretrained_policy,
-        shipped_folder,
-        vision_steps,
-    )
+    from clbench.learning.pretraining import SHIPPED, pretrained_folder, shipped_folder
     from clbench.policy.kinds import policy_class
     from clbench.spec.registry import load_scenario
 
     add_cwd_to_path()
+    plan = Plan()
     with checked_input():
         loaded = load_scenario(scenario).with_policy(policy)
         if ship and not (SHIPPED.parents[1] / "pyproject.toml").is_file():
             raise InputError("--ship needs a checkout of clbench: it does not change an installed package.")
         policy_class(kind_of(loaded.policy))
         check_folders({})
-        plan = Plan()
-        if not is_pretrained(loaded, seed):
-            plan.add_pretraining_data(scenario, loaded)
-    _do(plan, workers)
-    length = loaded.budget.pretraining_steps + vision_steps(loaded)
-    with checked_input(), Bars(length) as bars:  # the disk may be full
-        name = f"{loaded.id} pretraining seed {seed}"
-        bars.start(name, length)
-        _, folder = pretrained_policy(loaded, seed, lambda steps: bars.advance(name, steps))
-        shipped = shipped_folder(loaded, seed)
-        if ship and folder != shipped:
-            shutil.rmtree(shipped, ignore_errors=True)
-            folder = shutil.copytree(folder, shipped)
-        bars.finish(name, f"in {folder}")
+        plan.add_pretraining(scenario, loaded, seed)
+    if plan.jobs:
+        _do(plan, workers)
+    folder, shipped = pretrained_folder(loaded, seed), shipped_folder(loaded, seed)
+    if ship and folder != shipped:
+        shutil.rmtree(shipped, ignore_errors=True)
+        folder = shutil.copytree(folder, shipped)
+    print_plain(Console(stderr=True), f"{loaded.id} pretraining seed {seed}: in {folder}")
 
 
 def measure(scenario: ScenarioId, /, *tasks: str, episodes: Annotated[int, whole_number(1)] = 100) -> None:

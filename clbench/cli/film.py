@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from rich.console import Console
 
-from clbench.base.cache import hash_of
+from clbench.base.cache import hash_of, hash_of_tensors
 from clbench.base.errors import InputError
 from clbench.base.text import megabytes
 from clbench.cli.arguments import (
     MethodName,
+    PolicyName,
     ScenarioId,
     Seed,
     add_cwd_to_path,
@@ -26,6 +28,7 @@ from clbench.cli.arguments import (
 )
 from clbench.jobs.folders import check_folders
 from clbench.spec.identifiers import LONGEST_LABEL
+from clbench.spec.policies import DEFAULT_POLICY
 
 LONGEST_NAME = 120
 """Characters of a film's name before a hash; file systems take 255 bytes."""
@@ -42,6 +45,8 @@ def film(
     /,
     *methods: MethodName,
     seed: Seed = 0,
+    order: Seed = 0,
+    policy: PolicyName = DEFAULT_POLICY,
     tasks: str | None = None,
     stages: str | None = None,
     episode: Annotated[int, whole_number(0)] = 0,
@@ -55,13 +60,17 @@ def film(
     """Film METHODS on SCENARIO: their policies side by side, from the same initial states.
 
     With one method, the film shows the policy after each stage; with several, before the first target and
-    after the last. It uses the policies that `clbench run` kept. If there are none, clbench trains them
-    again, without evaluation.
+    after the last. Methods that start from the same policy share the column before the first target. The film
+    uses the policies that `clbench run` kept. If there are none, clbench trains them again, without
+    evaluation.
 
     Args:
         scenario: Gymnasium id of the scenario.
         methods: Names of installed methods, or module:Class; at least one.
         seed: Seed of the run.
+        order: Order of the targets, as for `clbench run`.
+        policy: flow or discrete_diffusion; a larger size, for example flow-base (5 million parameters) or
+            flow-large (40 million); or a class of your own, as module:Class.
         tasks: Names of tasks, for example press,lift (default: all retained skills and targets).
         stages: Numbers of stages, for example 0,4 (default: all stages for one method, 0 and the last for
             several). Stage 0 is before any target.
@@ -87,9 +96,8 @@ def film(
         if fps is not None and fps > FASTEST:
             raise InputError(f"--fps must be from 1 to {FASTEST}, not {fps}.")
         check_device(device)
-        runs = [
-            RunSpec(scenario, name, seed, changes or {}, device).resolve() for name in dict.fromkeys(methods)
-        ]
+        first = RunSpec(scenario, "", seed, changes or {}, device, order=order, policy=policy)
+        runs = [replace(first, method=name).resolve() for name in dict.fromkeys(methods)]
         loaded = runs[0].scenario
         names = None if tasks is None else items_of("--tasks", tasks)
         shown = loaded.retained + loaded.target if names is None else tuple(map(loaded.task, names))
@@ -138,15 +146,22 @@ def _cut(name: str, most: int) -> str:
 def _policies(
     runs: Sequence[ResolvedRun], numbers: Sequence[int], checkpoints: Path | None, console: Console
 ) -> dict[str, Policy]:
-    """Return the policies by the captions of their columns; methods share the one before any target."""
+    """Return the policies by the captions of their columns; equal policies before any target share one."""
     from clbench.runs.film import column_of
     from clbench.runs.stages import load_stages
+    from clbench.runs.start import starts_as_pretrained
 
     columns: dict[str, Policy] = {}
+    shared = None
     for run, folder in zip(runs, _stages_folders(runs, checkpoints, console), strict=True):
         stages = load_stages(run, folder)
+        # beside its weights, `prepare` of a stranger's method may change what a policy computes
+        start = hash_of_tensors(stages[0].state_dict()) if starts_as_pretrained(run) else run.label
+        shared = shared or start
         for number in numbers:
-            columns.setdefault(column_of(run, number, alone=len(runs) == 1), stages[number])
+            caption = column_of(run, number, alone=len(runs) == 1)
+            own = not number and start != shared
+            columns.setdefault(f"{run.label}, {caption}" if own else caption, stages[number])
     return columns
 
 

@@ -53,7 +53,7 @@ COMMANDS = {
 }
 """Entry points of the commands, in the groups of `clbench --help`."""
 
-NAMES = {
+USAGES = {
     "run": "SCENARIOS [METHODS...]",
     "status": "[SCENARIOS] [METHODS...]",
     "leaderboard": "[SCENARIO]",
@@ -135,9 +135,9 @@ def _app(name: str, text: str | None, commands: dict[Group, dict[str, str]]) -> 
     )
     for group, members in commands.items():
         for number, (command, entry_point) in enumerate(members.items()):
-            names = NAMES.get(command)
+            arguments = USAGES.get(command)
             program = name if name == "clbench" else f"clbench {name}"
-            usage = f"Usage: {program} {command} [OPTIONS] {names}" if names else None
+            usage = f"Usage: {program} {command} [OPTIONS] {arguments}" if arguments else None
             made.command(entry_point, name=command, group=group, sort_key=number, usage=usage)
     return made
 

@@ -32,7 +32,7 @@ from clbench.cli.arguments import (
 from clbench.jobs.folders import check_folders
 from clbench.records.paths import RECORDS, record_path
 from clbench.spec.policies import DEFAULT_POLICY
-from clbench.spec.protocol import DEFAULT_SEEDS
+from clbench.spec.protocol import DEFAULT_SEEDS, FIRST_TUNING_SEED
 
 if TYPE_CHECKING:
     from clbench.jobs.job import Workers
@@ -66,7 +66,7 @@ def run(
     """Run METHODS on SCENARIOS, once per seed, and write a record of each run.
 
     The command first makes missing inputs: demonstrations, then a pretrained policy for each seed. It skips
-    runs that have a record: repeat a stopped command to continue it.
+    runs that have succeeded: repeat a stopped command to continue it. Runs that failed are done again.
 
     Args:
         scenarios: Gymnasium id of the scenario, for example clbench/Fetch-v1, or several ids separated by
@@ -115,7 +115,7 @@ def run(
         if tensorboard:
             require_tensorboard()
         spec = RunSpec("", "", first_seed, changes or {}, device, order=order, perturb=perturb, policy=policy)
-        runs = requested(scenarios, methods, every, seeds, spec, records)
+        runs = requested(ids, methods, every, seeds, spec, records)
         chosen = _part(shard, runs)
         check_folders({"--records": records, "--checkpoints": checkpoints, "--tensorboard": tensorboard})
     console = Console(stderr=True, quiet=quiet)
@@ -130,9 +130,11 @@ def run(
         return
     pool = partial(_workers, workers, ray, device)
     went_well = do_runs(chosen, records, pool, checkpoints, tensorboard, quiet)
-    # the board shows neither a run with changed settings nor one that failed
-    if not changes and (went_well or any(has_record(run, records) for run in chosen)):
-        print_plain(console, _next(records))
+    # the board shows no run with changed settings or a seed for tuning, and none that failed
+    shown = [] if changes else [run for run in chosen if run.spec.seed < FIRST_TUNING_SEED]
+    with checked_input():
+        if shown and (went_well or any(has_record(run, records) for run in shown)):
+            print_plain(console, _next(records))
     if not went_well:
         sys.exit(1)
 
@@ -244,12 +246,12 @@ def _rates(record: Record) -> str:
 
 
 def requested(
-    scenarios: str, methods: Sequence[str], every: bool, seeds: int, first: RunSpec, records: Path
+    scenarios: Sequence[str], methods: Sequence[str], every: bool, seeds: int, first: RunSpec, records: Path
 ) -> list[ResolvedRun]:
     """Return the runs of methods on scenarios, neighbours of one seed together.
 
     Args:
-        scenarios: Ids of the scenarios, separated by commas.
+        scenarios: Ids of the scenarios.
         methods: Names of methods.
         every: Whether all installed methods are meant.
         seeds: Number of seeds.
@@ -262,7 +264,7 @@ def requested(
     names = chosen_methods(methods, every)
     runs = [
         replace(first, scenario=scenario, method=name, seed=seed).resolve()
-        for scenario in items_of("SCENARIOS", scenarios)
+        for scenario in scenarios
         for seed in range(first.seed, first.seed + seeds)
         for name in names
     ]
@@ -297,8 +299,7 @@ def _workers(count: int | None, ray: str | None, device: str) -> Workers:
         return Processes(count, device)
     from clbench.jobs.ray import RayWorkers
 
-    with checked_input():
-        return RayWorkers(ray, count)
+    return RayWorkers(ray, count)
 
 
 def _print_forecast(

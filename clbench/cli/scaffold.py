@@ -12,7 +12,7 @@ from rich.console import Console
 
 from clbench.base.errors import InputError
 from clbench.base.text import print_plain, quoted
-from clbench.cli.arguments import checked_input
+from clbench.cli.arguments import checked_input, checked_writing
 from clbench.spec.identifiers import built_in_methods, check_method_name
 from clbench.spec.policies import POLICIES
 
@@ -101,15 +101,13 @@ def _write(kind: str, name: str, folder: Path, test: str) -> tuple[Path, Path]:
     made: list[Path] = []
     try:
         for path, text in texts.items():
-            with path.open("x", encoding="utf-8", newline="\n") as file:
+            with checked_writing(path), path.open("x", encoding="utf-8", newline="\n") as file:
                 made.append(path)
                 named = text.replace(f"{kind}_template", name)
                 file.write(named.replace(f"{kind.capitalize()}Template", class_name(name)))
-    except BaseException as error:
+    except BaseException:
         for path in made:
             path.unlink()
-        if isinstance(error, OSError):
-            raise InputError(f"{error.filename} cannot be written: {error.strerror}.") from error
         raise
     first, second = texts
     return first, second
@@ -127,7 +125,8 @@ def check_new_name(name: str, kind: str) -> None:
         InputError: The name is taken, too like another, or not valid for a module; the message shows which.
     """
     if not re.fullmatch("[a-z][a-z0-9_]{0,49}", name):
-        near = re.sub(r"\W+|(?<=[a-z0-9])(?=[A-Z])", "_", name, flags=re.ASCII).lower().strip("_0123456789")
+        words = re.sub(r"\W+|(?<=[a-z0-9])(?=[A-Z])", "_", name, flags=re.ASCII).lower()
+        near = words.lstrip("_0123456789").rstrip("_")
         hint = f" Did you mean {near!r}?" if re.fullmatch("[a-z][a-z0-9_]{0,49}", near) else ""
         raise InputError(
             f"{quoted(name)} cannot be the name of a module: it must begin with a letter, and have at most "

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args
 
@@ -31,12 +30,11 @@ from clbench.cli.arguments import (
 from clbench.cli.runs import requested
 from clbench.records.paths import RECORDS
 from clbench.records.reader import RecordError, UnreadableRecordError, check_home, read_record
-from clbench.spec.identifiers import check_known
+from clbench.spec.identifiers import check_known, folder_name, without_module
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.protocol import DEFAULT_SEEDS
 
 if TYPE_CHECKING:
-    from clbench.records.record import Record
     from clbench.runs.spec import ResolvedRun
 
 NOT_GIVEN: Mapping[str, object] = {
@@ -45,6 +43,8 @@ NOT_GIVEN: Mapping[str, object] = {
     "--first-seed": 0,
     "--order": 0,
     "--policy": DEFAULT_POLICY,
+    "--perturb": False,
+    "--device": "cpu",
 }
 """Values of the options that choose among the runs of a scenario, where nobody gave them."""
 
@@ -52,7 +52,7 @@ State = Literal["done", "running", "failed", "damaged", "unreadable", "to do"]
 
 STATES: tuple[State, ...] = get_args(State)
 
-OTHER_SETTINGS = "its record has different settings, budget or code: `clbench run` repeats the run"
+OTHER_SETTINGS = "its record has different settings, budget, device or code: `clbench run` repeats the run"
 """Reason of a run that is to do although its place has a record."""
 
 
@@ -63,7 +63,8 @@ class RunState(NamedTuple):
     """Path of its record."""
     state: State
     """A run is damaged if its record is torn or contradicts itself; `clbench run` does it again. It is
-    unreadable if its record may be sound: it is of a newer clbench, or the file system refuses it."""
+    unreadable if `clbench run` refuses its record, which may be sound: it is of a newer clbench or of another
+    definition of its scenario, or the file system refuses it."""
     owner: Owner | None = None
     """Process that does the run."""
     progress: Report | None = None
@@ -90,15 +91,17 @@ def status(
     first_seed: Seed = 0,
     order: Seed = 0,
     policy: PolicyName = DEFAULT_POLICY,
+    perturb: bool = False,
     records: Path = RECORDS,
+    device: str = "cpu",
     changes: Annotated[dict[str, str] | None, Parameter(name="--set")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Show which runs are done, running, failed or still to do, and how much time is left.
 
-    Without arguments the command shows every run in the folder of records. With the arguments of
-    `clbench run` it shows those runs, including runs that no command has started. You can use it while other
-    commands or machines work in the same folder.
+    Without arguments the command shows every run in the folder of records; with SCENARIOS alone, every run of
+    these scenarios. With the arguments of `clbench run` it shows those runs, including runs that no command
+    has started. You can use it while other commands or machines work in the same folder.
 
     Args:
         scenarios: Gymnasium id of the scenario, or several ids separated by commas.
@@ -109,32 +112,34 @@ def status(
         order: Order of the targets, as for `clbench run`.
         policy: flow or discrete_diffusion; a larger size, for example flow-base (5 million parameters) or
             flow-large (40 million); or a class of your own, as module:Class.
+        perturb: Count only records with perturbed episodes.
         records: Folder of the records.
+        device: Device that runs the policies: a record of another device does not count.
         changes: Hyper-parameters that differ from those tuned for the scenario or, without tuning, from the
             method's defaults, as --set.name value.
         as_json: Print a JSON list with an object for each run, and no table.
     """
     add_cwd_to_path()
     with checked_input():
-        if scenarios is None:
-            values = (every, seeds, first_seed, order, policy)
-            options = zip(NOT_GIVEN, values, strict=True)
-            given = [name for name, value in options if value != NOT_GIVEN[name]]
-            given += [f"--set.{name}" for name in changes or {}]
-            if given:
-                chosen = f"{listed(given)} {'needs' if len(given) == 1 else 'need'}"
-                raise InputError(f"{chosen} a scenario: name the scenario first.")
-            paths = found_runs(records)
-            if not paths:
-                raise InputError(f"There are no runs in {records}: `clbench run` makes them.")
-            states = [run_state(path) for path in paths]
-        else:
-            check_known(items_of("SCENARIOS", scenarios), methods)
+        ids = [] if scenarios is None else items_of("SCENARIOS", scenarios)
+        given = _given((every, seeds, first_seed, order, policy, perturb, device), changes or {})
+        if given and not ids:
+            chosen = f"{listed(given)} {'needs' if len(given) == 1 else 'need'}"
+            raise InputError(f"{chosen} a scenario: name the scenario first.")
+        check_known(ids, methods)
+        if methods or given:
             from clbench.runs.spec import RunSpec
 
-            spec = RunSpec("", "", first_seed, changes or {}, order=order, policy=policy)
-            runs = requested(scenarios, methods, every, seeds, spec, records)
+            first = RunSpec(
+                "", "", first_seed, changes or {}, device, order=order, perturb=perturb, policy=policy
+            )
+            runs = requested(ids, methods, every, seeds, first, records)
             states = [run_state(run.path(records), run) for run in runs]
+        else:
+            states = [run_state(path) for path in found_runs(records, ids)]
+            if not states:
+                named = f" of {listed(ids)}" if ids else ""
+                raise InputError(f"There are no runs{named} in {records}: `clbench run` makes them.")
     if as_json:
         print_json([_values(state, records) for state in states])
         return
@@ -147,6 +152,13 @@ def status(
     console.print(_summary(states), highlight=False)
 
 
+def _given(values: Iterable[object], changes: Iterable[str]) -> list[str]:
+    """Return the names of the options that were given: those of `NOT_GIVEN` by their values, and --set."""
+    pairs = zip(NOT_GIVEN.items(), values, strict=True)
+    options = [name for (name, usual), value in pairs if value != usual]
+    return [*options, *(f"--set.{name}" for name in changes)]
+
+
 def run_state(path: Path, run: ResolvedRun | None = None) -> RunState:
     """Return the state of the run whose record has the path.
 
@@ -154,6 +166,7 @@ def run_state(path: Path, run: ResolvedRun | None = None) -> RunState:
         path: Path of the record.
         run: The run that was asked for: a record of other settings is not its record. If None, any record is.
     """
+    from clbench.jobs.recorded import is_of
     from clbench.scoring.scores import Scores
 
     lease = Lease(path)
@@ -167,9 +180,9 @@ def run_state(path: Path, run: ResolvedRun | None = None) -> RunState:
         check_home(record.run, path)
         if record.error is None:
             Scores.from_record(record)
-            if run is not None and not _is_of(record, run):
-                return RunState(path, "to do", reason=OTHER_SETTINGS)
-    except UnreadableRecordError as error:
+        if run is not None and not is_of(record, run, path):
+            return RunState(path, "to do", reason=OTHER_SETTINGS)
+    except (UnreadableRecordError, InputError) as error:
         return RunState(path, "unreadable", reason=str(error))
     except RecordError as error:
         return RunState(path, "damaged", reason=str(error))
@@ -181,21 +194,21 @@ def run_state(path: Path, run: ResolvedRun | None = None) -> RunState:
     return RunState(path, "done", seconds=seconds)
 
 
-def _is_of(record: Record, run: ResolvedRun) -> bool:
-    from clbench.jobs.recorded import changed_code, has_settings_of
+def found_runs(records: Path, scenarios: Iterable[str] = ()) -> list[Path]:
+    """Return the paths of the records below a folder, and of those that are being made.
 
-    here = replace(record.run, device=run.info.device)  # the device is not asked for
-    return has_settings_of(replace(record, run=here), run) and not changed_code(record, run)
-
-
-def found_runs(records: Path) -> list[Path]:
-    """Return the paths of the records below a folder, and of those that are being made."""
+    Args:
+        records: Folder of the records.
+        scenarios: Ids of the scenarios whose runs are returned; if there are none, all runs are.
+    """
     made = set(records.glob("*/*/seed-*.json"))
     running = {
         path.with_name(path.name.removeprefix(".").removesuffix(".lease"))
         for path in records.glob(f"*/*/{lease_path(Path('seed-*.json')).name}")
     }
-    return sorted(made | running)
+    names = {folder_name(without_module(scenario)) for scenario in scenarios}
+    # the runs of another policy are in a folder with its name after a +
+    return sorted(path for path in made | running if not names or path.parts[-3].partition("+")[0] in names)
 
 
 def seconds_left(states: Iterable[RunState]) -> float | None:

@@ -6,6 +6,7 @@ import itertools
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -64,8 +65,8 @@ def tune(
     strength; a method without a strength runs with two more learning rates instead. Runs learn all targets,
     with seeds that no board uses, and never see test episodes. Of the settings whose success right after the
     stages (`learned`) is at least 0.8, the one with the best final average wins. A setting with a failed
-    run, for example because the loss diverged, is not chosen. Runs with a record are skipped: repeat a
-    stopped command to continue it, or to see the choice again.
+    run, for example because the loss diverged, is not chosen. Runs that have succeeded are skipped: repeat a
+    stopped command to continue it. Runs that failed are done again.
 
     With --values, the methods run with every combination of these values instead, plain fine-tuning runs
     beside them, and nothing is chosen.
@@ -98,10 +99,6 @@ def tune(
     if targets is not None:  # a run of fewer targets must not replace the record of all
         records = records / f"targets-{targets}"
     numbers = range(first_seed, first_seed + seeds)
-
-    def run(wanted: Mapping[str, Sequence[Settings]]) -> dict[str, list[Tried]]:
-        return _run(wanted, first, numbers, workers, records)
-
     add_cwd_to_path()
     with checked_input():
         first = RunSpec(
@@ -117,8 +114,9 @@ def tune(
         classes = {name: load_method(name) for name in names}
         if write is not None:
             check_tuned(write, table, numbers, names)
-        ladder = {name: rungs(cls, fixed) for name, cls in classes.items()}
         combinations = _combinations(values or {})
+        ladder = {} if values else {name: rungs(cls, fixed) for name, cls in classes.items()}
+    run = partial(_run, first=first, seeds=numbers, workers=workers, records=records)
     if values:
         found = run({BASELINE: [{}], **{name: _besides(name, combinations) for name in names}})
         Console().print(_table(table, {name: (None, one) for name, one in found.items()}, seeds))
@@ -284,13 +282,13 @@ def _table(name: str, found: Mapping[str, tuple[Settings | None, Sequence[Tried]
         table.add_column(title, overflow="fold")
     for title in ("learned", "final average"):
         table.add_column(title, justify="right")
-    for name, (chosen, every) in found.items():
+    for method, (chosen, every) in found.items():
         table.add_section()
         for tried in every:
             style = "bold" if tried.settings == chosen else ""
             scores = (tried.learned, ".2f"), (tried.final_average, ".3f")
             values = ["failed" if score is None else format(score, form) for score, form in scores]
-            table.add_row(name, _words(tried.settings), *values, style=style)
+            table.add_row(method, _words(tried.settings), *values, style=style)
     return table
 
 

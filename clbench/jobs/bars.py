@@ -11,8 +11,15 @@ from typing import Self
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
-from rich.progress import TimeRemainingColumn as TimeLeftColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskID,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from clbench.base.text import clock_time, print_plain, printable, printable_lines
 
@@ -64,7 +71,7 @@ class Bars:
             BarColumn(),
             TaskProgressColumn(),
             TimeElapsedColumn(),
-            TimeLeftColumn(),
+            TimeRemainingColumn(),
             TextColumn("left"),
             console=Console() if self._in_notebook() else self.console,
             disable=not (self.console.is_terminal or self._in_notebook()),
@@ -136,8 +143,16 @@ class Bars:
             self._progress.update(self._all, total=self._total, completed=min(self._done + 1e-9, self._total))
         else:
             self.advance(piece, shown.left)
-        del self._pieces[piece]
-        self._progress.remove_task(shown.bar)
+        self._remove(piece, text)
+
+    def postpone(self, piece: Hashable, text: str) -> None:
+        """Remove the bar of a piece that starts again later, take its progress back, and print why."""
+        shown = self._pieces[piece]
+        self.advance(piece, shown.left - shown.length)
+        self._remove(piece, text)
+
+    def _remove(self, piece: Hashable, text: str) -> None:
+        self._progress.remove_task(self._pieces.pop(piece).bar)
         self.say(f"{piece}: {text}")
 
     def say(self, line: str) -> None:

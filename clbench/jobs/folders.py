@@ -6,17 +6,12 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from clbench.base.cache import cache_folder
+from clbench.base.cache import cache_folder, minari_folder
 from clbench.base.errors import InputError
 from clbench.base.leftovers import unfinished
 
 PLACES = ("CLBENCH_CACHE", "XDG_CACHE_HOME", "MINARI_DATASETS_PATH")
 """Environment variables that name data folders."""
-
-
-def minari_folder() -> Path:
-    """Return the folder of all Minari datasets."""
-    return Path(os.environ.get("MINARI_DATASETS_PATH") or "~/.minari/datasets").expanduser().absolute()
 
 
 def absolute_places() -> dict[str, str]:

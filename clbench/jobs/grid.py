@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rich.console import Console
 
-from clbench.base.cache import cache_folder
+from clbench.base.cache import cache_folder, minari_folder
 from clbench.base.errors import ClbenchError, InputError, WrongTypeError
 from clbench.base.leftovers import sweep
 from clbench.base.text import counted, print_plain, printable
 from clbench.jobs.bars import lines_console
-from clbench.jobs.folders import check_folders, minari_folder
+from clbench.jobs.folders import check_folders
 from clbench.jobs.job import Job, Workers
 from clbench.jobs.processes import Here, Processes
 from clbench.jobs.recorded import has_record, set_aside
@@ -104,7 +105,7 @@ def run_missing(
         InputError: A record was made with another definition of its scenario, or this machine cannot render
             what a scenario needs.
     """
-    from clbench.jobs.work import do_run, make_policies
+    from clbench.jobs.work import do_run
 
     sweep(records, cache_folder(), minari_folder() / "clbench", *([checkpoints] if checkpoints else []))
     to_do = missing(runs, records, checkpoints)
@@ -125,25 +126,39 @@ def run_missing(
     failed = run_with_bars(plan.jobs, pool, console)
     if check in failed:
         return failed
-    seconds = time.monotonic() - begin
+    minutes = (time.monotonic() - begin) / 60
     run_jobs = [job for job in plan.jobs if job.function is do_run]
-    lost = _without_record(run_jobs, failed, records)
-    for job, reason in lost.items():
+    for job, reason in _without_record(run_jobs, failed, records).items():
         _print(console, f"{job}: {reason}")
-    failed |= lost
-    lost_runs = sum(job in failed for job in run_jobs)
-    done = f"{_part(lost_runs, len(to_do.runs))}{counted(len(to_do.runs), 'run')}"
-    if to_do.stages:
-        lost_stages = sum(job.function is make_policies for job in failed)
-        done += f" and the policies of {_part(lost_stages, len(to_do.stages))}{len(to_do.stages)}"
-    _print(console, f"{done} in {seconds / 60:.1f} minutes; records in {records}.")
-    bare = missing(to_do.runs, records, checkpoints).stages
-    if bare:
-        kept = f"but kept no policies in {checkpoints}. Repeat the command to make and keep these policies."
-        _print(console, f"Another command did {counted(len(bare), 'run')} {kept}")
-        theirs = {run.path(records.absolute()) for run in bare}
-        failed |= {job: f"another command did this run {kept}" for job in run_jobs if _path(job) in theirs}
+        failed[job] = reason
+    _print(console, f"{_done(to_do, failed)} in {minutes:.1f} minutes; records in {records}.")
+    if checkpoints:
+        bare = missing(to_do.runs, records, checkpoints).stages
+        failed |= _without_policies(run_jobs, bare, records, checkpoints, console)
     return failed
+
+
+def _done(to_do: Missing, failed: Iterable[Job]) -> str:
+    """Return in words how many of the runs, and of the policies to make again, are done."""
+    from clbench.jobs.work import do_run, make_policies
+
+    lost = Counter(job.function for job in failed)
+    done = f"{_part(lost[do_run], len(to_do.runs))}{counted(len(to_do.runs), 'run')}"
+    if not to_do.stages:
+        return done
+    return f"{done} and the policies of {_part(lost[make_policies], len(to_do.stages))}{len(to_do.stages)}"
+
+
+def _without_policies(
+    jobs: Sequence[Job], bare: Sequence[ResolvedRun], records: Path, checkpoints: Path, console: Console
+) -> dict[Job, str]:
+    """Return the jobs whose runs another command did without keeping policies, each with this reason."""
+    if not bare:
+        return {}
+    kept = f"but kept no policies in {checkpoints}. Repeat the command to make and keep these policies."
+    _print(console, f"Another command did {counted(len(bare), 'run')} {kept}")
+    theirs = {run.path(records.absolute()) for run in bare}
+    return {job: f"another command did this run {kept}" for job in jobs if _path(job) in theirs}
 
 
 def _path(job: Job) -> Path | None:
@@ -220,6 +235,8 @@ def run(
 def run_specs(firsts: Sequence[RunSpec], seeds: int, records: Path, workers: int | None) -> list[Record]:
     """Do the runs in `firsts`, each for `seeds` seeds from its own seed on, and return their records.
 
+    All runs are on one device. If what the runs of a class of this script need cannot be made, nothing runs.
+
     Raises:
         UnknownNameError: There is no such scenario, method or hyper-parameter.
         InputError: A value cannot be used; the message says which. Or other processes cannot import the
@@ -227,15 +244,16 @@ def run_specs(firsts: Sequence[RunSpec], seeds: int, records: Path, workers: int
         RunsFailedError: A run failed.
     """
     whole_number("seeds", seeds, 1)
-    whole_number("workers", workers, 1)
     if seeds > MOST_SEEDS:
         raise InputError(f"seeds must be at most {MOST_SEEDS:,}, not {seeds}.")
+    if workers is not None:
+        whole_number("workers", workers, 1)
     check_known([one.scenario for one in firsts], [one.method for one in firsts])
     firsts = [replace(one, scenario=importable(one.scenario)) for one in firsts]
     if any(one.policy.startswith("__main__:") for one in firsts):
         raise InputError("A policy must be in a module: other processes cannot import a class of a notebook.")
-    for device in {one.device for one in firsts}:
-        check_device(device)
+    device = firsts[0].device
+    check_device(device)
     specs = [replace(one, seed=one.seed + number) for one in firsts for number in range(seeds)]
     runs = [spec.resolve() for spec in specs]
     console = lines_console()
@@ -243,18 +261,22 @@ def run_specs(firsts: Sequence[RunSpec], seeds: int, records: Path, workers: int
     if to_do:
         check_folders({"records": records})
     # other processes cannot import the class, but can make what its runs need
-    needed = Missing([run for run in to_do if _is_typed(run)], []).plan(records, None).inputs
-    failed = run_with_bars(needed, Processes(workers), console) if needed else {}
-    typed, others = [run for run in runs if _is_typed(run)], [run for run in runs if not _is_typed(run)]
-    device = firsts[0].device
-    failed |= run_missing(others, records, lambda: Processes(workers, device), console) if others else {}
-    failed |= run_missing(typed, records, Here, console) if typed else {}
-    if failed:
-        raise RunsFailedError("\n".join(f"{job}: {reason}" for job, reason in failed.items()))
+    needed = Missing([run for run in to_do if _is_of_main(run)], []).plan(records, None).inputs
+    _check_all_done(run_with_bars(needed, Processes(workers), console) if needed else {})
+    here, others = [run for run in runs if _is_of_main(run)], [run for run in runs if not _is_of_main(run)]
+    failed = run_missing(others, records, lambda: Processes(workers, device), console) if others else {}
+    failed |= run_missing(here, records, Here, console) if here else {}
+    _check_all_done(failed)
     return [read_record(run.path(records)) for run in runs]
 
 
-def _is_typed(run: ResolvedRun) -> bool:
+def _check_all_done(failed: Mapping[Job, str]) -> None:
+    """Raise an error with the reason for each failure, if there is one."""
+    if failed:
+        raise RunsFailedError("\n".join(f"{job}: {reason}" for job, reason in failed.items()))
+
+
+def _is_of_main(run: ResolvedRun) -> bool:
     """Return whether the method of a run is a class of this notebook or script."""
     return run.spec.method.startswith("__main__:")
 

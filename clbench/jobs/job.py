@@ -94,17 +94,25 @@ def chain_times(
 Outcome = Literal["done", "failed", "taken"]
 """How a job ended, as it reported; a job is taken if another process took over its work."""
 
+Ending = Outcome | Literal["lost"]
+"""How a job ended; it is lost if its process ended without a result."""
+
 
 class Event(NamedTuple):
     """A message from a worker."""
 
     job: Job
     """Job that it is about."""
-    kind: Literal["progress", "at", "lost"] | Outcome
-    """All kinds but the first two end the job. A job is lost if its process ended without a result."""
+    kind: Literal["progress", "at"] | Ending
+    """What the message says: the progress of the job, its place, or how it ended."""
     value: Any
     """Length done since the last event, the place that the job has reached, the text that it returned, or the
     reason of the failure."""
+
+    @property
+    def ends_job(self) -> bool:
+        """Whether the job has ended."""
+        return self.kind not in ("progress", "at")
 
 
 class Workers(Protocol):

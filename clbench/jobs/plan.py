@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from clbench.jobs import work
 from clbench.jobs.job import Job, Product
 from clbench.jobs.recorded import has_failed, has_record
 from clbench.learning.pretraining import is_pretrained, vision_steps
+from clbench.learning.watching import watches
 from clbench.policy.kinds import policy_class
 from clbench.records.paths import table_name
 from clbench.runs.length import point_length, run_length, training_length, watching_length
@@ -103,10 +104,10 @@ class Plan:
             _label(run),
             work.do_run,
             {"spec": run.spec, **folders},
-            run_length(run.scenario, run.protocol) + watching_length(run.method, run.scenario),
-            (*self._needs(run), *((start,) if start else ())),
-            limits,
-            _record_of(run, records),
+            length=run_length(run.scenario, run.protocol) + watching_length(run.method, run.scenario),
+            needs=(*self._needs(run), *((start,) if start else ())),
+            limits=limits,
+            product=_record_of(run, records),
         )
 
     def add_stages(self, run: ResolvedRun, checkpoints: Path | None, limits: Limits | None = None) -> Job:
@@ -117,12 +118,16 @@ class Plan:
             checkpoints: Folder below which the policies are kept; None leaves them only in the cache.
             limits: Limits of the process of the job; None sets none.
         """
-        arguments = {"spec": run.spec, "checkpoints": checkpoints and checkpoints.absolute()}
-        title = f"stages of {_label(run)}"
-        length = training_length(run.scenario) + watching_length(run.method, run.scenario)
-        product = None if checkpoints is None else _policies_of(run, checkpoints.absolute())
-        needs = self._needs(run)
-        return self._add(run, title, work.make_policies, arguments, length, needs, limits, product)
+        return self._add(
+            run,
+            f"stages of {_label(run)}",
+            work.make_policies,
+            {"spec": run.spec, "checkpoints": checkpoints and checkpoints.absolute()},
+            length=training_length(run.scenario) + watching_length(run.method, run.scenario),
+            needs=self._needs(run),
+            limits=limits,
+            product=None if checkpoints is None else _policies_of(run, checkpoints.absolute()),
+        )
 
     def add_demonstrations(self, name: str, scenario: Scenario, tasks: Iterable[Task]) -> tuple[Job, ...]:
         """Add jobs that collect the demonstrations of tasks, and return them.
@@ -133,22 +138,6 @@ class Plan:
             tasks: Tasks of the scenario.
         """
         return tuple(self._demonstrations(name, scenario, task) for task in tasks)
-
-    def _add(
-        self,
-        run: ResolvedRun,
-        title: str,
-        function: Callable[..., str],
-        arguments: Mapping[str, Any],
-        length: float,
-        needs: tuple[Job, ...],
-        limits: Limits | None = None,
-        product: Product | None = None,
-    ) -> Job:
-        title = _title(run.spec.scenario, title, run.spec.policy)
-        job = Job(title, function, {**arguments}, length, needs, limits, run.spec.device, _pace(run), product)
-        self._runs.append(job)
-        return job
 
     def add_pretraining_data(self, name: str, scenario: Scenario) -> tuple[Job, ...]:
         """Add jobs that collect everything that a policy is pretrained on, and return them.
@@ -162,25 +151,55 @@ class Plan:
         tasks = () if policy_class(kind_of(scenario.policy)).pretrained else scenario.pretrained
         return self._question_job(name, scenario), *self.add_demonstrations(name, scenario, tasks)
 
-    # ---- needs of runs -----------------------------------------------------------------------------
+    def add_pretraining(self, name: str, scenario: Scenario, seed: int) -> Job | None:
+        """Add the job that pretrains the policy of a seed, with all jobs that it needs, and return it.
 
-    def _needs(self, run: ResolvedRun) -> tuple[Job, ...]:
-        """Return the jobs that a run waits for, except the evaluation of its start."""
-        name, scenario = run.spec.scenario, run.scenario
-        policy = self._policy(name, scenario, run.spec.seed)
-        targets = self.add_demonstrations(name, scenario, scenario.target)
-        prior = scenario.retained if run.method.uses.demonstrations != "never" else ()
-        retained = self.add_demonstrations(name, scenario, prior)
-        return (*((policy,) if policy else ()), self._question_job(name, scenario), *targets, *retained)
+        Args:
+            name: Id of the scenario, as the user typed it.
+            scenario: The scenario, with its policy.
+            seed: Seed of the policy.
 
-    def _policy(self, name: str, scenario: Scenario, seed: int) -> Job | None:
-        """Return the job that pretrains the policy of a seed, None if the policy ships or is in the cache."""
+        Returns:
+            The job; None if the policy ships or is in the cache.
+        """
         key = name, scenario.policy, seed
         if key not in self._policies:
             self._policies[key] = (
                 None if is_pretrained(scenario, seed) else self._pretraining(name, scenario, seed)
             )
         return self._policies[key]
+
+    def _add(
+        self,
+        run: ResolvedRun,
+        title: str,
+        function: Callable[..., str],
+        arguments: dict[str, Any],
+        *,
+        length: float,
+        needs: tuple[Job, ...],
+        limits: Limits | None,
+        product: Product | None,
+    ) -> Job:
+        title = _title(run.spec.scenario, title, run.spec.policy)
+        device, pace = run.spec.device, _pace(run)
+        job = Job(title, function, arguments, length, needs, limits, device, pace, product)
+        self._runs.append(job)
+        return job
+
+    # ---- needs of runs -----------------------------------------------------------------------------
+
+    def _needs(self, run: ResolvedRun) -> tuple[Job, ...]:
+        """Return the jobs that a run waits for, except the evaluation of its start."""
+        name, scenario = run.spec.scenario, run.scenario
+        policy = self.add_pretraining(name, scenario, run.spec.seed)
+        targets = self.add_demonstrations(name, scenario, scenario.target)
+        prior = scenario.retained if run.method.uses.demonstrations != "never" else ()
+        retained = self.add_demonstrations(name, scenario, prior)
+        # it pretrains once more, even if the policy is there
+        watched = self.add_pretraining_data(name, scenario) if watches(run.method) else ()
+        data = (self._question_job(name, scenario), *targets, *retained, *watched)
+        return (*((policy,) if policy else ()), *dict.fromkeys(data))
 
     def _pretraining(self, name: str, scenario: Scenario, seed: int) -> Job:
         steps = scenario.budget.pretraining_steps + vision_steps(scenario)
@@ -193,11 +212,17 @@ class Plan:
         """Return the job that evaluates the start of a run, None if the cache has the evaluation."""
         spec = run.spec
         key = (
-            *(spec.scenario, spec.policy, spec.seed, spec.order, spec.targets),
-            *(spec.split, spec.perturb, spec.device),
+            spec.scenario,
+            spec.policy,
+            spec.seed,
+            spec.order,
+            spec.targets,
+            spec.split,
+            spec.perturb,
+            spec.device,
         )
         if key not in self._starts:
-            policy = self._policy(spec.scenario, run.scenario, spec.seed)
+            policy = self.add_pretraining(spec.scenario, run.scenario, spec.seed)
             if policy is None and is_evaluated(run):
                 self._starts[key] = None
             else:
@@ -222,10 +247,8 @@ class Plan:
         key = name, task.name
         if key not in self._data:
             _check_recording(task, scenario.budget)
-            title, arguments = (
-                _title(name, f"demonstrations {task.name}"),
-                {"scenario": name, "task": task.name},
-            )
+            title = _title(name, f"demonstrations {task.name}")
+            arguments = {"scenario": name, "task": task.name}
             length = scenario.budget.demonstrations
             self._data[key] = Job(title, work.collect_demonstrations, arguments, length, self._first)
         return self._data[key]

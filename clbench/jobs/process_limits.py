@@ -56,8 +56,7 @@ def end(process: int) -> None:
 
 def end_group(leader: int) -> None:
     """Kill what is left of the process group that `leader` leads: children may outlive their parent."""
-    if hasattr(os, "killpg"):
-        signal_group(leader, signal.SIGKILL)
+    signal_group(leader, signal.SIGKILL)
 
 
 def signal_group(leader: int, number: signal.Signals) -> None:

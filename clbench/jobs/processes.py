@@ -14,6 +14,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from types import ModuleType
@@ -110,7 +111,7 @@ class Processes:
                 worker.place, remark = value
                 value = f"{worker.place} {remark}".strip()
             event = Event(worker.job, kind, value)
-            if event.kind not in ("progress", "at"):
+            if event.ends_job:
                 del self._running[connection]
                 _leave(worker.process)
             yield event
@@ -194,7 +195,7 @@ class Here:
         with suppress(queue.Empty):
             event = self._events.get(timeout=1.0)
             while True:
-                if event.kind not in ("progress", "at"):
+                if event.ends_job:
                     self._thread.join()
                     self._job = None
                 yield event
@@ -209,9 +210,8 @@ class Here:
 
 def _handles_suspension() -> bool:
     """Return whether Ctrl-Z would stop this process and can be handled here."""
-    if not hasattr(signal, "SIGTSTP") or threading.current_thread() is not threading.main_thread():
-        return False
-    return signal.getsignal(signal.SIGTSTP) is signal.SIG_DFL
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    return in_main_thread and signal.getsignal(signal.SIGTSTP) is signal.SIG_DFL
 
 
 def _leave(process: BaseProcess) -> None:
@@ -259,10 +259,6 @@ def _script_hidden() -> Iterator[None]:
 
 def _context() -> Any:
     """Return how processes start: forked from one that has imported everything (50 ms), or new (2 s)."""
-    if "forkserver" not in multiprocessing.get_all_start_methods():
-        return multiprocessing.get_context("spawn")
-    from multiprocessing import forkserver, resource_tracker  # cannot be imported where there is none
-
     context = multiprocessing.get_context("forkserver")
     # the second module also takes a second, and PyTorch's deterministic algorithms import it
     context.set_forkserver_preload(["clbench.runs.run", "torch._inductor.config"])
@@ -332,11 +328,10 @@ def _work(
     os.environ.clear()
     os.environ.update(environment)
     multiprocessing.current_process().daemon = False  # otherwise a method could not start processes
-    if hasattr(os, "setpgid"):
-        os.setpgid(0, 0)  # so that the parent can end them with this process
+    os.setpgid(0, 0)  # so that the parent can end them with this process
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers when Ctrl-C reaches it
-    if hasattr(signal, "pthread_sigmask"):  # children of a job must not inherit the mask of the server
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    # children of a job must not inherit the mask of the server
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
     def tell(kind: str, value: Any) -> None:
         try:

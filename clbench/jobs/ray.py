@@ -115,6 +115,7 @@ class RayWorkers:
                 yield Event(job, "progress", amount)
         for reference in ended:
             job = self._running.pop(reference)
+            self._shown.pop(job, None)  # it may start again
             yield Event(job, *self._end(job, reference))
 
     def _amounts(self) -> dict[str, float]:
@@ -220,8 +221,6 @@ def _do_apart(actor: Any, job: Job) -> tuple[Outcome, str]:
     Raises:
         LostProcessError: The process was killed.
     """
-    # otherwise the process reads the main program of this one, which is Ray's, and imports Ray
-    vars(sys.modules["__main__"]).pop("__file__", None)
     processes = Processes(1)
     processes.start(job)
     try:

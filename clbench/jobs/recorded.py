@@ -9,8 +9,8 @@ import platform
 from pathlib import Path
 
 from clbench.base.errors import InputError
+from clbench.records.fingerprints import machine_of, other_parts
 from clbench.records.paths import free_name
-from clbench.records.pinned import machine_of, other_parts
 from clbench.records.reader import RecordError, UnreadableRecordError, read_record
 from clbench.records.record import Record
 from clbench.runs.spec import ResolvedRun
@@ -37,9 +37,19 @@ def has_record(run: ResolvedRun, records: Path) -> bool:
         raise
     except RecordError:
         return False
-    if record.status != "success" or not has_settings_of(record, run) or changed_code(record, run):
+    return record.status == "success" and is_of(record, run, path)
+
+
+def is_of(record: Record, run: ResolvedRun, path: Path) -> bool:
+    """Return whether the record at `path` is of exactly this run, a success or a failure.
+
+    Raises:
+        InputError: The run succeeded with another definition of the scenario.
+    """
+    if not has_settings_of(record, run) or changed_code(record, run):
         return False
-    _check_definition(record, run.published, path)
+    if record.status == "success":
+        _check_definition(record, run.published, path)
     return True
 
 
@@ -57,11 +67,12 @@ def has_settings_of(record: Record, run: ResolvedRun) -> bool:
 
 def has_failed(run: ResolvedRun, records: Path) -> bool:
     """Return whether exactly this run has a record, and failed."""
+    path = run.path(records)
     try:
-        record = read_record(run.path(records))
+        record = read_record(path)
     except RecordError:
         return False
-    return record.status == "failed" and has_settings_of(record, run) and not changed_code(record, run)
+    return record.status == "failed" and is_of(record, run, path)
 
 
 def set_aside(run: ResolvedRun, records: Path) -> str | None:

@@ -12,9 +12,7 @@ from clbench.base import interrupts
 from clbench.base.errors import ClbenchError
 from clbench.base.lease import Lease
 from clbench.jobs.bars import Bars
-from clbench.jobs.job import Job, Workers, chain_times
-
-DONE, FAILED = "done by another command", "failed in another command"
+from clbench.jobs.job import Ending, Event, Job, Workers, chain_times
 
 WAIT_SECONDS = 1.0
 """Seconds between two looks at jobs that other commands do."""
@@ -32,67 +30,103 @@ def run_jobs(jobs: Sequence[Job], workers: Workers, bars: Bars) -> dict[Job, str
         workers: Workers that do the jobs; they are closed at the end.
         bars: Bars that show the progress.
     """
-    waiting, started = _by_urgency(jobs), dict[Job, float]()
-    succeeded: set[Job] = set()
-    failed: dict[Job, str] = {}
-    leases = _Leases(jobs)
+    scheduler = _Scheduler(jobs, workers, bars)
     try:
-        while waiting or started:
-            interrupts.check()
-            waiting = _drop_hopeless(waiting, failed)
-            taken = leases.take(_ready(waiting, succeeded), workers.free())
-            for job, fault in taken.items():
-                waiting.remove(job)
-                ending = fault or _ending(job)
-                if ending is not None:
-                    leases.release(job)
-                    if ending == DONE:
-                        succeeded.add(job)
-                    else:
-                        failed[job] = ending
-                    bars.skip(job, job.duration, ending)
-                    continue
-                workers.start(job)
-                started[job] = time.monotonic()
-                bars.start(job, job.duration)
-            if not started and not taken and waiting:
-                leases.wait(waiting, workers.free() > 0, bars)
-            for job, kind, value in workers.events() if started else ():
-                if kind == "progress":
-                    bars.advance(job, value * job.pace)
-                    leases.report(job, bars.share(job))
-                    continue
-                if kind == "at":
-                    bars.place(job, value)
-                    continue
-                leases.release(job)
-                if kind == "done":
-                    succeeded.add(job)
-                elif kind == "taken":
-                    waiting.append(job)
-                else:
-                    failed[job] = value
-                bars.finish(job, f"{value} ({time.monotonic() - started.pop(job):.0f} s)")
-            if started:
-                bars.tick()
+        scheduler.do_all()
     finally:
         try:
             workers.close()
         finally:  # a second signal may interrupt it
-            leases.close()
-    return failed
+            scheduler.leases.close()
+    return scheduler.failed
 
 
-def _ending(job: Job) -> str | None:
+class _Scheduler:
+    """The jobs that are waiting, are running and have ended."""
+
+    def __init__(self, jobs: Sequence[Job], workers: Workers, bars: Bars) -> None:
+        self.leases = _Leases(jobs)
+        self.failed: dict[Job, str] = {}
+        self._workers, self._bars = workers, bars
+        self._waiting = _by_urgency(jobs)
+        self._started: dict[Job, float] = {}
+        self._succeeded: set[Job] = set()
+
+    def do_all(self) -> None:
+        """Do the jobs until none is waiting or running."""
+        while self._waiting or self._started:
+            interrupts.check()
+            self._leave_out()
+            began = self._begin()
+            if not self._started and not began and self._waiting:
+                self.leases.wait(self._waiting, self._workers.free() > 0, self._bars)
+            for event in self._workers.events() if self._started else ():
+                self._hear(event)
+            if self._started:
+                self._bars.tick()
+
+    def _leave_out(self) -> None:
+        """Leave out the jobs that need a job that failed."""
+        for job in [*self._waiting]:
+            lost = next((needed for needed in job.needs if needed in self.failed), None)
+            if lost is not None:
+                self._skip(job, "failed", f"left out, because {lost} failed")
+
+    def _begin(self) -> bool:
+        """Start as many jobs as possible, and return whether any began or was found to have ended."""
+        ready = [job for job in self._waiting if self._succeeded.issuperset(job.needs)]
+        taken = self.leases.take(ready, self._workers.free())
+        for job, fault in taken.items():
+            ending: tuple[Ending, str] | None = ("failed", fault) if fault else _ending_elsewhere(job)
+            if ending is not None:
+                self._skip(job, *ending)
+                continue
+            self._waiting.remove(job)
+            self._workers.start(job)
+            self._started[job] = time.monotonic()
+            self._bars.start(job, job.duration)
+        return bool(taken)
+
+    def _hear(self, event: Event) -> None:
+        """Show the progress of a job, or settle how it ended."""
+        job, kind, value = event
+        if kind == "progress":
+            self._bars.advance(job, value * job.pace)
+            self.leases.report(job, self._bars.share(job))
+        elif kind == "at":
+            self._bars.place(job, value)
+        else:
+            self._settle(job, kind, value)
+            text = f"{value} ({time.monotonic() - self._started.pop(job):.0f} s)"
+            (self._bars.postpone if kind == "taken" else self._bars.finish)(job, text)
+
+    def _skip(self, job: Job, kind: Ending, text: str) -> None:
+        """Settle a waiting job that is not to be done here."""
+        self._waiting.remove(job)
+        self._settle(job, kind, text)
+        self._bars.skip(job, job.duration, text)
+
+    def _settle(self, job: Job, kind: Ending, text: str) -> None:
+        """Note how a job ended; one that another process took over waits again."""
+        self.leases.release(job)
+        if kind == "done":
+            self._succeeded.add(job)
+        elif kind == "taken":
+            self._waiting.append(job)
+        else:
+            self.failed[job] = text
+
+
+def _ending_elsewhere(job: Job) -> tuple[Ending, str] | None:
     """Return how a job ended elsewhere, or why that is not known; None if the job is still to be done."""
     if job.product is None:
         return None
     try:
         if job.product.exists():
-            return DONE
-        return FAILED if job.product.has_failed() else None
+            return "done", "done by another command"
+        return ("failed", "failed in another command") if job.product.has_failed() else None
     except ClbenchError as error:
-        return str(error)
+        return "failed", str(error)
 
 
 class _Leases:
@@ -167,20 +201,3 @@ def _by_urgency(jobs: Sequence[Job]) -> list[Job]:
     """
     times = chain_times(jobs)
     return sorted(jobs, key=lambda job: -times[job])
-
-
-def _drop_hopeless(waiting: list[Job], failed: dict[Job, str]) -> list[Job]:
-    """Return the jobs that can still be done; the others fail because a job that they need failed."""
-    kept = []
-    for job in waiting:
-        missing = [needed for needed in job.needs if needed in failed]
-        if missing:
-            failed[job] = f"left out, because {missing[0]} failed"
-        else:
-            kept.append(job)
-    return kept
-
-
-def _ready(waiting: Sequence[Job], succeeded: set[Job]) -> list[Job]:
-    """Return the jobs whose needs have succeeded, in their order."""
-    return [job for job in waiting if succeeded.issuperset(job.needs)]

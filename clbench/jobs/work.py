@@ -96,8 +96,8 @@ def do_run(
             shortened(f"failed in {record.failure}", run.path(records).relative_to(records).as_posix())
         )
     scores = Scores.from_record(record)
-    names = ["adaptation", "retention", "question_retention"]
-    names[2:2] = ["perturbed_retention"] if spec.perturb else []
+    perturbed = ["perturbed_retention"] if spec.perturb else []
+    names = ["adaptation", "retention", *perturbed, "question_retention"]
     values = {name: measure(name, scores) for name in names}
     text = ", ".join(f"{name} {'-' if value is None else f'{value:.2f}'}" for name, value in values.items())
     start = record.retained_at_start()

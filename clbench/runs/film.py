@@ -280,7 +280,7 @@ def film_runs(
     width: int,
     progress: ProgressCallback = no_progress,
 ) -> Film:
-    """Return the film of one run, or of several runs of the same scenario and seed.
+    """Return the film of one run, or of several runs that differ in their method alone.
 
     Args:
         runs: The runs.
@@ -290,14 +290,15 @@ def film_runs(
         width: Width of a picture, in pixels.
         progress: Called with the number of takes made since its last call.
     """
-    scenario, seed = runs[0].scenario, runs[0].spec.seed
+    first, scenario, seed = runs[0], runs[0].scenario, runs[0].spec.seed
     trials = [Trial(task, "validation", number) for task in tasks]
     rows = [
         f"{task.name} ({scenario.group(task.name).replace('_', ' ')}): {start_of(trial, seed)[1]}"
         for task, trial in zip(tasks, trials, strict=True)
     ]
     labels = ", ".join(run.label for run in runs)
-    title = f"{scenario.id}, {labels}, seed {seed}, validation episode {number}"
+    order = f" order {first.spec.order}" if first.spec.order else ""
+    title = f"{first.table}, {labels}, seed {seed}{order}, validation episode {number}"
     takes = shoot(scenario, seed, list(policies.values()), trials, width, progress)
     return Film(title, rows, list(policies), takes)
 

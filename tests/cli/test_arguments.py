@@ -89,6 +89,7 @@ def test_a_path_may_begin_with_the_home_folder(
         (["run", "clbench/Fetch-v1", "sft", "--shard", "9/8"], "--shard must be i/n with i from 1 to n"),
         (["run", "clbench/Fetch-v1", "sft", "--shard", "half"], "for example 2/8, not 'half'"),
         (["run", "clbench/Fetch-v1", "sft", "--seeds", "1_0"], "it must be a whole number, not '1_0'"),
+        (["run", "clbench/Fetch-v1", "sft", "--seeds", "_5"], "it must be a whole number, not '_5'"),
         (["run", "clbench/Fetch-v1", "sft", "--records", ""], "--records must not be empty."),
         (["leaderboard", "--records="], "--records must not be empty."),
         (

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from clbench.base.cache import cache_folder, cached, hash_of
+from clbench.base.cache import cache_folder, cached, hash_of, minari_folder
 from clbench.base.lease import Lease
 from clbench.cli.cache import entries, find_stale
 from clbench.cli.main import app
-from clbench.jobs.folders import minari_folder
 from clbench.records.record import Record
 from clbench.records.writer import record_text
 

@@ -2,6 +2,7 @@
 
 import copy
 import json
+from importlib import metadata
 from pathlib import Path
 
 import gymnasium
@@ -30,6 +31,22 @@ def test_lists_fit_the_terminal_and_cut_no_name(
         assert max(map(len, lines)) <= width
         words = {word.rstrip(",:") for line in lines for word in line.split()}
         assert names <= words
+
+
+@pytest.mark.long
+def test_doctor_advises_the_extra_of_a_package_too(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr(
+        "clbench.cli.catalogue.version", lambda name: "0.1" if name == "minari" else metadata.version(name)
+    )
+    with pytest.raises(SystemExit, match="1"):
+        app(["doctor"])
+    shown = capsys.readouterr().out
+    advice = "pip install 'minari[hdf5]<0.6,>=0.5.4'"
+    assert shown.count(advice) == 2  # in the table, and at the end
+    assert shown.splitlines()[-1].endswith(f"cannot run here yet: {advice}")
 
 
 def test_methods_are_listed_by_the_prior_data_that_they_use(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,6 +1,6 @@
 """`clbench demonstrations` with its export, `clbench pretrain`, and `clbench experts measure`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -8,9 +8,10 @@ import pytest
 from clbench.base.cache import cache_folder
 from clbench.cli.data import DEMONSTRATIONS
 from clbench.cli.main import app
+from clbench.jobs.job import Job
+from clbench.jobs.work import pretrain
 from clbench.learning import pretraining
 from clbench.spec.registry import load_scenario
-from clbench.spec.scenario import Scenario
 
 TOY = "clbench.testing:clbench/Toy-v0"
 
@@ -37,15 +38,24 @@ def test_a_policy_is_pretrained_unless_it_is_in_the_cache(capsys: pytest.Capture
 
 @pytest.mark.parametrize("name", ["flow-base", "discrete_diffusion-large"])
 def test_a_policy_of_any_size_is_pretrained(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = []
+    made: list[str] = []
 
-    def note(scenario: Scenario, seed: int, progress: object) -> tuple[None, Path]:
-        made.append(scenario.policy)
-        return None, Path("made")
+    def note(jobs: Sequence[Job], *_: object) -> dict[Job, str]:
+        made.extend(job.arguments["policy"] for job in jobs if job.function is pretrain)
+        return {}
 
-    monkeypatch.setattr("clbench.learning.pretraining.pretrained_policy", note)
+    monkeypatch.setattr("clbench.jobs.scheduler.run_with_bars", note)
     _clbench("pretrain", TOY, "--policy", name)
     assert made == [name]
+
+
+def test_no_bar_is_drawn_for_a_policy_that_is_there(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, folder = pretraining.pretrained_policy(load_scenario(TOY), 0)
+    monkeypatch.setattr("clbench.jobs.bars.Bars.__init__", lambda *_: pytest.fail("a bar"))
+    _clbench("pretrain", TOY)
+    assert capsys.readouterr().err == f"clbench/Toy-v0 pretraining seed 0: in {folder}\n"
 
 
 @pytest.mark.parametrize(

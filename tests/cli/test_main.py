@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from clbench import __version__
+from clbench.base.errors import InputError
 from clbench.cli.main import COMMANDS, app
 from clbench.jobs.job import Job
 from clbench.jobs.work import do_run
@@ -111,6 +112,37 @@ def test_a_folder_that_cannot_be_written_to_is_named_before_work_begins(
     assert f"error: {option} {file} cannot be written to: Not a directory." in message
     assert file.read_text() == "precious"
     assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(("first_seed", "is_shown"), [(99, True), (100, False)])
+def test_a_run_names_the_board_only_if_the_board_shows_its_seeds(
+    first_seed: int,
+    is_shown: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("clbench.cli.runs.do_runs", lambda *_: True)
+    words = ["run", TOY, "sft", "--first-seed", str(first_seed), "--seeds", "2"]
+    app(words, result_action="return_value")
+    assert ("Next: clbench leaderboard" in capsys.readouterr().err) == is_shown
+
+
+def test_a_record_that_is_refused_after_the_runs_is_an_error_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(*_: object) -> bool:
+        raise InputError("it was made with another definition")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("clbench.cli.runs.do_runs", lambda *_: False)
+    monkeypatch.setattr("clbench.jobs.recorded.has_record", refuse)
+    with pytest.raises(SystemExit, match="2"):
+        app(["run", TOY, "sft", "--seeds", "1"], result_action="return_value")
+    assert capsys.readouterr().err.splitlines()[-1] == "error: it was made with another definition"
 
 
 def test_a_folder_with_markup_in_its_name_is_shown_as_it_is(

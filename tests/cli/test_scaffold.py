@@ -1,10 +1,13 @@
 """`clbench new-method` and `new-policy`: files that work as they are, and names that are refused."""
 
+import errno
+import os
 import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tiny import TINY
@@ -126,6 +129,7 @@ def test_a_record_of_a_fresh_policy_is_replayed_only_if_the_verifier_names_it(
 
 OWN = """
 from pathlib import Path
+from typing import Any
 
 import torch
 from fresh_policy import FreshPolicy
@@ -229,11 +233,31 @@ def test_the_next_steps_name_another_folder(
     ]
 
 
+def test_a_full_disk_names_the_file_and_leaves_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usual = Path.open
+
+    def full(path: Path, *arguments: Any, **options: Any) -> Any:
+        file = usual(path, *arguments, **options)
+        if "x" in arguments:
+            monkeypatch.setattr(file, "write", refuse)
+        return file
+
+    def refuse(_: str) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "open", full)
+    path = re.escape(str(tmp_path / "freshly_written.py"))
+    with pytest.raises(InputError, match=rf"^{path} cannot be written: No space left on device\.$"):
+        write_method("freshly_written", tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [
         ("", "'' cannot be the name of a module"),
         ("MyMethod", "Did you mean 'my_method'?"),
+        ("MyMethod2", "Did you mean 'my_method2'?"),
         ("my-method", "digits and _. Did you mean 'my_method'?"),
         ("2fast", "Did you mean 'fast'?"),
         ("_mine", "Did you mean 'mine'?"),

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -94,10 +95,69 @@ def test_a_record_of_other_settings_is_not_that_of_the_run(
     assert not has_record(RunSpec(TINY, "frozen", seed=0).resolve(), tmp_path)
     resolve("clbench.cli.status:status")(TINY, "frozen", seeds=1, records=tmp_path)
     shown = capsys.readouterr().out
-    assert "me--Tiny-v0/frozen/seed-0: to do, its record has different settings, budget or code" in shown
+    assert (
+        "me--Tiny-v0/frozen/seed-0: to do, its record has different settings, budget, device or code" in shown
+    )
     assert "1 run: 1 to do." in shown
     resolve("clbench.cli.status:status")(records=tmp_path)
     assert "1 run: 1 done." in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("option", [{"device": "cuda"}, {"perturb": True}])
+def test_status_and_run_agree_on_the_device_and_on_perturbed_episodes(
+    option: dict[str, Any], records: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status = resolve("clbench.cli.status:status")
+    for spec, asked in ((RunSpec(TINY, "frozen", 0, **option), option), (RunSpec(TINY, "frozen", 0), {})):
+        status(TINY, "frozen", seeds=1, records=records, **asked)
+        done = has_record(spec.resolve(), records)
+        assert f"1 run: 1 {'done' if done else 'to do'}." in capsys.readouterr().out
+        assert done == (not asked)
+
+
+def test_a_record_of_another_device_is_to_do_as_run_repeats_it(
+    done: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = dataclasses.replace(done, run=dataclasses.replace(done.run, device="cuda"))
+    write_record(other, RunSpec(TINY, "frozen", seed=0).path(tmp_path))
+    resolve("clbench.cli.status:status")(TINY, "frozen", seeds=1, records=tmp_path)
+    assert "1 run: 1 to do." in capsys.readouterr().out
+    resolve("clbench.cli.status:status")(TINY, "frozen", seeds=1, records=tmp_path, device="cuda")
+    assert "1 run: 1 done." in capsys.readouterr().out
+
+
+def test_a_record_of_another_definition_which_run_refuses_is_not_done(
+    records: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("clbench.jobs.recorded.other_parts", lambda *_: ["worlds"])
+    resolve("clbench.cli.status:status")(TINY, "frozen", seeds=1, records=records)
+    shown = capsys.readouterr().out
+    assert "me--Tiny-v0/frozen/seed-0: unreadable, " in shown
+    assert "was made with another definition of me/Tiny-v0: worlds differ." in shown
+
+
+def test_a_scenario_alone_shows_its_runs_in_the_folder(
+    records: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = records / "Toy-v0" / "sft" / "seed-0.json"
+    sized = records / "me--Tiny-v0+flow-base" / "sft" / "seed-7.json"
+    for path in (other, sized):
+        path.parent.mkdir(parents=True)
+        path.write_text("{", encoding="utf-8")
+    resolve("clbench.cli.status:status")(TINY, records=records, as_json=True)
+    found = {entry["run"]: entry["state"] for entry in json.loads(capsys.readouterr().out)}
+    assert found == {
+        "me--Tiny-v0/frozen/seed-0": "done",
+        "me--Tiny-v0/sft/seed-0": "damaged",
+        "me--Tiny-v0+flow-base/sft/seed-7": "damaged",
+    }
+
+
+def test_a_scenario_without_runs_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        resolve("clbench.cli.status:status")("clbench/Fetch-v1", records=tmp_path)
+    said = " ".join(capsys.readouterr().err.split())
+    assert "There are no runs of clbench/Fetch-v1 in" in said
 
 
 def test_an_empty_folder_is_said_to_be_empty(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -107,7 +167,9 @@ def test_an_empty_folder_is_said_to_be_empty(tmp_path: Path, capsys: pytest.Capt
     assert "There are no runs in" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("option", [["--all"], ["--seeds", "2"], ["--set.step_factor", "2"]])
+@pytest.mark.parametrize(
+    "option", [["--all"], ["--seeds", "2"], ["--set.step_factor", "2"], ["--perturb"], ["--device", "cuda"]]
+)
 def test_an_option_that_chooses_among_the_runs_of_a_scenario_needs_one(
     option: list[str], records: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

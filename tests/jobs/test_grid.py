@@ -23,7 +23,7 @@ from clbench.jobs.job import Job
 from clbench.jobs.processes import Here
 from clbench.jobs.scheduler import run_with_bars
 from clbench.runs.run import execute
-from clbench.runs.spec import RunSpec
+from clbench.runs.spec import ResolvedRun, RunSpec
 from clbench.runs.stages import has_stages, keep_stages
 from clbench.spec.limits import Limits
 
@@ -149,6 +149,41 @@ def test_runs_that_failed_are_not_counted_and_neither_are_the_jobs_that_they_sha
     assert re.match(r"0 of 2 runs in \d+\.\d minutes; records in ", last)
 
 
+def test_inputs_that_fail_are_tried_once_and_told_once(
+    tmp_path: Path, empty_caches: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+
+    def fail(jobs: Sequence[Job], *_: Any) -> dict[Job, str]:
+        calls.append([job.title for job in jobs])
+        return dict.fromkeys(jobs, "no room")
+
+    monkeypatch.setattr(sys.modules["__main__"], "Typed", clbench.load_method("frozen"), raising=False)
+    monkeypatch.setattr("clbench.jobs.grid.run_with_bars", fail)
+    with pytest.raises(clbench.RunsFailedError) as failed:
+        clbench.run(TOY, "__main__:Typed", seeds=1, records=tmp_path / "records")
+    (titles,) = calls
+    assert "Toy-v0 pretraining seed 0" in titles
+    assert str(failed.value).splitlines() == [f"{title}: no room" for title in titles]
+
+
+def test_records_are_read_twice_at_most_if_no_policies_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reads = []
+
+    def look(run: ResolvedRun, _: Path) -> bool:
+        reads.append(run.spec.seed)
+        return False
+
+    for module in ("grid", "plan"):
+        monkeypatch.setattr(f"clbench.jobs.{module}.has_record", look)
+    monkeypatch.setattr("clbench.jobs.grid.run_with_bars", lambda *_: {})
+    runs = [RunSpec(TOY, "frozen", seed).resolve() for seed in range(2)]
+    run_missing(runs, tmp_path / "records", Here, Console(file=io.StringIO()))
+    assert sorted(reads) == [0, 0, 1, 1]  # before the jobs and after them
+
+
 def test_a_class_inside_a_function_is_refused(tmp_path: Path) -> None:
     class Hidden(clbench.Method):
         pass
@@ -210,6 +245,7 @@ def test_making_policies_of_a_submitted_method_again_has_the_limits_of_its_check
     ("wrong", "message"),
     [
         ({"seeds": 1.5}, "seeds must be a whole number from 1, not 1.5"),
+        ({"seeds": None}, "seeds must be a whole number from 1, not None"),
         ({"seeds": 0}, "seeds must be a whole number from 1, not 0"),
         ({"seeds": 10_001}, "seeds must be at most 10,000, not 10001"),
         ({"seeds": np.int64(10_001)}, "seeds must be at most 10,000, not 10001"),
@@ -293,7 +329,8 @@ def test_what_a_notebook_defines_is_refused_before_anything_is_made(
     monkeypatch.setitem(gymnasium.registry, "me/Typed-v0", None)  # the end of the test forgets it
     del gymnasium.registry["me/Typed-v0"]
     clbench.register("me/Typed-v0", "__main__:SCENARIO")
-    with pytest.raises(ValueError, match="me/Typed-v0 is defined in a notebook or script: put it"):
+    message = "me/Typed-v0 is defined in a notebook or script, which other processes cannot import: put it"
+    with pytest.raises(ValueError, match=message):
         clbench.run("me/Typed-v0", "frozen", records=tmp_path)
     with pytest.raises(ValueError, match="A policy must be in a module"):
         clbench.run(TOY, "frozen", policy="__main__:Policy", records=tmp_path)

@@ -141,6 +141,20 @@ def test_only_a_policy_that_is_pretrained_here_needs_the_demonstrations_of_skill
     assert titles == ["Toy-v0 questions", *(f"Toy-v0 demonstrations {task.name}" for task in tasks)]
 
 
+def test_a_method_that_watches_the_pretraining_waits_for_the_background_even_if_the_policy_is_there(
+    write_module: Callable[[str, str], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_module("watching_the_background", WATCHING)
+    monkeypatch.setattr("clbench.jobs.plan.is_pretrained", lambda *_: True)
+    for method, waits in (("watching_the_background:Watching", True), ("experience_replay", False)):
+        run = RunSpec(TOY, method, 0).resolve()
+        more = dataclasses.replace(run.scenario.retained[0], name="more")
+        run = dataclasses.replace(run, scenario=dataclasses.replace(run.scenario, background=(more,)))
+        titles = [job.title for job in Plan().add_stages(run, None).needs]
+        assert ("Toy-v0 demonstrations more" in titles) == waits
+        assert len(titles) == len(set(titles))
+
+
 def test_no_two_jobs_of_a_plan_have_one_title_with_a_policy_of_a_class(
     tmp_path: Path, empty_caches: Path
 ) -> None:

@@ -15,9 +15,8 @@ import psutil
 import pytest
 from helpers import printed
 
-from clbench.base.cache import cache_folder
+from clbench.base.cache import cache_folder, minari_folder
 from clbench.jobs.bars import Bars
-from clbench.jobs.folders import minari_folder
 from clbench.jobs.job import Job, Product
 from clbench.jobs.processes import Here, Processes, at_once
 from clbench.jobs.scheduler import run_jobs
@@ -66,8 +65,7 @@ def interrupts(progress):
     raise KeyboardInterrupt("of its own")
 
 def moves(progress, folder):
-    from clbench.base.cache import cache_folder
-    from clbench.jobs.folders import minari_folder
+    from clbench.base.cache import cache_folder, minari_folder
     os.chdir(folder)
     return f"{cache_folder()} and {minari_folder()}"
 """

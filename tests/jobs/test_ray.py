@@ -6,12 +6,13 @@ import os
 import re
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
+from rich.console import Console
 
 from clbench.jobs.bars import Bars
 from clbench.jobs.job import Job
@@ -59,6 +60,16 @@ def lost_always(progress):
 
 def endless(progress):
     time.sleep(60)
+
+def taken_once(progress, path):
+    from clbench.base.lease import LeaseLostError
+    time.sleep(0.3)
+    progress(1)
+    time.sleep(1.5)
+    if not Path(path).exists():
+        Path(path).touch()
+        raise LeaseLostError("lost to another process")
+    return "went well"
 
 def niceness(progress):
     return f"nicer by {os.nice(0)}"
@@ -147,6 +158,20 @@ def test_the_records_equal_those_of_one_machine(
     records = lasting_records(tmp_path / "here")
     assert len(records) == 3
     assert records == lasting_records(tmp_path / "ray")
+
+
+def test_a_job_that_another_process_took_over_is_shown_from_its_new_start(tmp_path: Path) -> None:
+    shares = []
+
+    class Watched(Bars):
+        def finish(self, piece: Hashable, text: str) -> None:
+            shares.append(self.share(piece))
+            super().finish(piece, text)
+
+    taken_once = importlib.import_module("some_jobs").taken_once
+    job = Job("taken", taken_once, {"path": str(tmp_path / "tried")}, 1)
+    assert run_jobs([job], RayWorkers("local", 1), Watched(1, Console(file=io.StringIO()))) == {}
+    assert shares == [1.0]
 
 
 def test_a_job_on_this_machine_has_normal_priority(bars: Bars) -> None:
