@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,9 @@ from clbench.data.access import check_episodes
 from clbench.spec.protocol import EpisodeKey, Split
 from clbench.spec.task import Task
 from clbench.worlds.lanes import Lanes
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 class Trial(NamedTuple):
@@ -81,7 +84,9 @@ class Live:
     shown: Any = None
     """The instruction as the actor reads it; `begin` of `play_in_lanes` sets it."""
     memory: Any = None
-    """Memory of the actor for this episode."""
+    """Memory of an agent for this episode."""
+    noise: Tensor | None = None
+    """Noise of a policy for all its forward passes in this episode, (passes, H, A)."""
     total_reward: float = 0.0
     length: int = 0
     success: bool = False

@@ -25,7 +25,7 @@ from clbench.base.errors import InputError, WrongTypeError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import derive_seed
 from clbench.evaluation.episodes import LANES, Episode, Live, Trial, play_in_lanes
-from clbench.evaluation.views import Views
+from clbench.evaluation.views import SimulatorCameras
 from clbench.spec.protocol import EpisodeKey
 from clbench.spec.scenario import Scenario
 from clbench.worlds.lanes import Lanes
@@ -205,13 +205,13 @@ def play_chunks(
     executed: int | None = None,
     whole: bool = True,
     progress: ProgressCallback = no_progress,
-    views: Views | None = None,
+    cameras: SimulatorCameras | None = None,
 ) -> ChunkPlay:
     """Return the outcome of each of `trials`.
 
     The policy observes `state`, float32 (LANES, S), `image`, uint8 (LANES, N, N, 3), where the tasks have a
     camera, `instruction`, texts, and what noise may be drawn from: `seed`, int64 (LANES,), different for each
-    episode, and `step`, int64 (LANES,), the steps taken in it. With `views` it also observes
+    episode, and `step`, int64 (LANES,), the steps taken in it. With `cameras` it also observes
     `pictures/<camera>`, uint8 (LANES, N, N, 3), of each camera. Unused rows repeat the first one.
 
     Args:
@@ -223,16 +223,16 @@ def play_chunks(
             the first chunk.
         whole: Whether all chunks must have exactly that length, or may be longer.
         progress: Called with the number of episodes that have ended since its last call.
-        views: Cameras of the simulator whose pictures the policy observes; None gives none.
+        cameras: Cameras of the simulator whose pictures the policy observes; None gives none.
 
     Raises:
         UnknownNameError: A scene has no such camera.
         InputError: The actions have the wrong shape, a chunk has another length, or nothing can be drawn.
         RenderingError: This machine cannot draw.
     """
-    if views is not None:
-        views.check(trial.task for trial in trials)
-    player = _ChunkPlayer(policy, executed, whole, views)
+    if cameras is not None:
+        cameras.check(trial.task for trial in trials)
+    player = _ChunkPlayer(policy, executed, whole, cameras)
     episodes = _play(player.act, scenario, trials, seed, "text", LANES, progress)
     assert player.executed is not None
     return ChunkPlay(episodes, player.executed, *player.shares(episodes))
@@ -292,7 +292,7 @@ class _ChunkPlayer:
     policy: ChunkPolicy
     executed: int | None
     whole: bool
-    views: Views | None = None
+    cameras: SimulatorCameras | None = None
     faults: dict[EpisodeKey, list[NDArray[np.bool_]]] = field(default_factory=dict)
     """For each episode, chunk after chunk, whether an action was not finite or was clipped, (H, 2)."""
 
@@ -309,7 +309,7 @@ class _ChunkPlayer:
         chunks = self.policy({**{name: np.stack(values) for name, values in columns.items()}, **texts})
         length = self._length(chunks)
         space = _space(lanes, live)
-        actions = _numbers(chunks, space, (LANES, length))[: len(live), : self.executed]
+        actions = _numbers("policy", chunks, space, (LANES, length))[: len(live), : self.executed]
         finite = np.isfinite(actions).all(axis=-1)
         outside = finite & ((actions < space.low) | (actions > space.high)).any(axis=-1)
         for one, found in zip(live, np.stack([~finite, outside], axis=-1), strict=True):
@@ -318,7 +318,7 @@ class _ChunkPlayer:
 
     def _pictures(self, lanes: Lanes, one: Live) -> dict[str, NDArray[np.uint8]]:
         """Return the pictures of an episode, by their names in observations."""
-        drawn = {} if self.views is None else self.views.draw(lanes, one.lane, one.trial.task)
+        drawn = {} if self.cameras is None else self.cameras.draw(lanes, one.lane, one.trial.task)
         return {f"pictures/{name}": picture for name, picture in drawn.items()}
 
     def _length(self, chunks: Any) -> int:
@@ -327,14 +327,20 @@ class _ChunkPlayer:
         Raises:
             InputError: They are not chunks, or have another length.
         """
-        length = int(np.shape(chunks)[1]) if np.ndim(chunks) == 3 else 0
+        shape = _shape(chunks)
+        length = shape[1] if len(shape) == 3 else 0
         known = self.executed
-        if length < (known or 1) or (self.whole and known not in (None, length)):
-            wanted = "any number of" if known is None else f"{'' if self.whole else 'at least '}{known}"
-            hint = f" as before; --executed {known} executes the first {known} of more" if self.whole else ""
+        if known is None:
+            fits, wanted = length >= 1, "any number of actions"
+        elif self.whole:
+            fits = length == known
+            wanted = f"{known} actions as before; executed={known} executes the first {known} of more"
+        else:
+            fits, wanted = length >= known, f"at least {known} actions"
+        if not fits:
             raise InputError(
-                f"The policy's actions have the shape {np.shape(chunks)}, not ({LANES}, H, A): for each "
-                f"episode {wanted} actions{hint if known else ''}."
+                f"The policy's actions have the shape {shape}, not ({LANES}, H, A): for each "
+                f"episode {wanted}."
             )
         self.executed = known or length
         return length
@@ -344,6 +350,19 @@ class _ChunkPlayer:
         found = [np.concatenate(self.faults[one.key])[: one.length] for one in episodes]
         not_finite, clipped = np.concatenate(found).mean(axis=0)
         return float(not_finite), float(clipped)
+
+
+def _shape(chunks: Any) -> tuple[int, ...]:
+    """Return the shape of the actions of a served policy.
+
+    Raises:
+        InputError: They are nested lists of different lengths.
+    """
+    try:
+        return np.shape(chunks)
+    except ValueError:
+        message = f"The policy's actions must have one shape ({LANES}, H, A), but its lists differ in length."
+        raise InputError(message) from None
 
 
 def _predicted(agent: Agent, observation: Any, **reminder: Any) -> tuple[Any, Any]:
@@ -367,7 +386,7 @@ def _checked(action: Any, lanes: Lanes, live: Sequence[Live], rows: tuple[int, .
         rows: Shape of the actions without A; () for a single action, which becomes (1, A).
     """
     space = _space(lanes, live)
-    numbers = _numbers(action, space, rows)
+    numbers = _numbers("agent", action, space, rows)
     return _within(numbers if rows else numbers[None], space)
 
 
@@ -377,8 +396,8 @@ def _space(lanes: Lanes, live: Sequence[Live]) -> spaces.Box:
     return space
 
 
-def _numbers(action: Any, space: spaces.Box, rows: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return actions as numbers of the shape (*rows, A)."""
+def _numbers(actor: str, action: Any, space: spaces.Box, rows: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return actions as numbers of the shape (*rows, A); messages name the actor."""
     shape = (*rows, *space.shape)
     try:
         given = np.asarray(action)
@@ -387,10 +406,10 @@ def _numbers(action: Any, space: spaces.Box, rows: tuple[int, ...]) -> NDArray[n
         numbers = np.asarray(given, np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"The agent's action must be {space.shape[0]} numbers, not a {type(action).__name__} ({error})."
+            f"The {actor}'s action must be {space.shape[0]} numbers, not a {type(action).__name__} ({error})."
         ) from error
     if numbers.shape != shape:
-        raise InputError(f"The agent's action has the shape {numbers.shape}, not {shape}.")
+        raise InputError(f"The {actor}'s action has the shape {numbers.shape}, not {shape}.")
     return numbers
 
 

@@ -117,7 +117,8 @@ class Evaluator:
         image = torch.zeros(rows, config.image_size, config.image_size, 3, dtype=torch.uint8)
         for row, one in enumerate(live):
             words[row] = one.shown
-            noise[row] = one.memory[one.length // config.executed]
+            assert one.noise is not None  # of `_begin`
+            noise[row] = one.noise[one.length // config.executed]
         shown = self._lanes.observe(
             [one.lane for one in live],
             [one.trial.task for one in live],
@@ -161,9 +162,9 @@ def _check_chunks(policy: Policy, chunks: object, rows: int) -> None:
 
 
 def _begin(policy: Policy, one: Live) -> None:
-    """Give an episode the tokens of its instruction, and noise for all its forward passes, (passes, H, A)."""
+    """Give an episode the tokens of its instruction, and the noise for all its forward passes."""
     config = policy.config
     one.shown = encode([one.instruction], config.text_length)[0]
     passes = -(-one.trial.task.horizon // config.executed)
     shape = (passes, config.chunk, config.action_size)
-    one.memory = torch.randn(shape, generator=torch_generator("noise", one.seed))
+    one.noise = torch.randn(shape, generator=torch_generator("noise", one.seed))

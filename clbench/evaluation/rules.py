@@ -69,8 +69,12 @@ class _Reached:
             self.texts[name] = repr(value)
         elif isinstance(value, np.ndarray | np.generic):
             self.texts[name] = repr(value.tolist())
-        elif isinstance(value, functools.partial):
+        elif isinstance(value, functools.partial | functools.partialmethod):
             self._add_all(name, {"function": value.func, "given": value.args, **value.keywords})
+        elif isinstance(value, functools.cached_property):
+            self.add(name, value.func)
+        elif isinstance(value, functools.singledispatchmethod):
+            self.add(name, value.dispatcher.registry)
         elif isinstance(value, Mapping):
             self._add_all(name, {repr(key): one for key, one in value.items()})
         elif isinstance(value, tuple | list):

@@ -28,29 +28,29 @@ SIZE = 224
 """Usual height and width of a picture, which OpenVLA and openpi read."""
 
 
-class Views:
+class SimulatorCameras:
     """Cameras of simulators, and the size of their pictures.
 
     A renderer belongs to one compiled scene and takes seconds to make, so it serves all episodes of a scene.
 
     Args:
-        cameras: Names of cameras that the scenes of all tasks have.
+        names: Names of cameras that the scenes of all tasks have.
         size: Height and width N of a picture in pixels.
 
     Raises:
         InputError: A name occurs twice or is not a text, or the size is not a whole number of at least 1.
     """
 
-    def __init__(self, cameras: Sequence[str], size: int = SIZE) -> None:
-        if len({*cameras}) < len(cameras) or not all(isinstance(name, str) for name in cameras):
-            raise InputError(f"Pictures are of different cameras, each named once, not {cameras!r}.")
-        self.cameras, self.size = tuple(cameras), int(whole_number("picture_size", size, 1) or SIZE)
+    def __init__(self, names: Sequence[str], size: int = SIZE) -> None:
+        if len({*names}) < len(names) or not all(isinstance(name, str) for name in names):
+            raise InputError(f"Pictures are of different cameras, each named once, not {names!r}.")
+        self.names, self.size = tuple(names), whole_number("picture_size", size, 1)
         self._renderers: dict[int, tuple[mujoco.MjModel, mujoco.Renderer]] = {}
 
     @property
     def settings(self) -> dict[str, Any]:
         """Settings that the record of a run keeps; empty without a camera."""
-        return {"pictures": list(self.cameras), "picture_size": self.size} if self.cameras else {}
+        return {"pictures": list(self.names), "picture_size": self.size} if self.names else {}
 
     def check(self, tasks: Iterable[Task]) -> None:
         """Refuse cameras that the scene of one of the tasks does not have, before any episode is played.
@@ -68,7 +68,7 @@ class Views:
                 names.append({model.camera(number).name for number in range(model.ncam)})
                 sizes.append(min(model.vis.global_.offwidth, model.vis.global_.offheight))
         common = set.intersection(*names) - {""}
-        for name in self.cameras:
+        for name in self.names:
             if not common:
                 raise InputError(f"There is no camera {name!r}: the scenes of the tasks share no camera.")
             if name not in common:
@@ -84,7 +84,7 @@ class Views:
         """
         model, data, _ = _drawable(lanes, lane, task)
         renderer, pictures = self._renderer(model), {}
-        for name in self.cameras:
+        for name in self.names:
             renderer.update_scene(data, camera=name)
             pictures[name] = renderer.render().copy()
         return pictures

@@ -88,7 +88,11 @@ def chosen_tasks(scenario: Scenario | str, tasks: Iterable[str]) -> tuple[Scenar
     return loaded, [loaded.task(name) for name in names] or [*loaded.retained, *loaded.target]
 
 
-def check_output(output: Path | str, kind: str, tasks: Sequence[Task]) -> Path:
+def check_output(
+    output: Path | str,
+    format: str,  # noqa: A002 - as in `export_demonstrations`
+    tasks: Sequence[Task],
+) -> Path:
     """Check the output of an export before any work starts, and return its folder.
 
     Raises:
@@ -96,9 +100,9 @@ def check_output(output: Path | str, kind: str, tasks: Sequence[Task]) -> Path:
         UnknownNameError: There is no such format.
         MissingPackageError: A package that the format needs is not installed.
     """
-    if kind not in get_args(Format):
-        raise unknown("format", kind, get_args(Format))
-    if kind == "lerobot":
+    if format not in get_args(Format):
+        raise unknown("format", format, get_args(Format))
+    if format == "lerobot":
         require("pyarrow", "exchange", "A LeRobotDataset")
         if any(task.camera is not None for task in tasks):
             require("PIL", "film", "A LeRobotDataset with pictures")

@@ -31,6 +31,7 @@ from clbench.data.demonstrations import Demonstration
 from clbench.exchange.shown import shown, steps_per_second
 from clbench.spec.language import LENGTHS, UnknownWordError, word_ids
 from clbench.spec.task import Task
+from clbench.worlds.lanes import control_rate
 from clbench.worlds.world import World
 
 GYM = 2
@@ -165,7 +166,6 @@ class _File:
         self._path, self._file, self._task, self._names = path, file, task, tuple(state)
         self._states, self._actions = world.observation_space, world.action_space
         self._convert = getattr(getattr(world, "vector_world", None), "recorded_states", None)
-        self._rate = world.metadata.get("render_fps")
 
     def demonstrations(self) -> list[Demonstration]:
         """Return all demonstrations, in the order of their numbers."""
@@ -210,12 +210,13 @@ class _File:
             )
         kwargs = _json(data.attrs.get("env_args")).get("env_kwargs")
         rate = kwargs.get("control_freq") if isinstance(kwargs, dict) else None
-        if not isinstance(rate, int | float) or self._rate is None:
+        if not isinstance(rate, int | float):
             return
-        if not abs(rate - self._rate) <= FARTHEST_RATE * self._rate:  # also if it is NaN
+        own = control_rate(self._task)
+        if own is not None and not abs(rate - own) <= FARTHEST_RATE * own:  # also if it is NaN
             raise self._error(
                 f"it was recorded at {rate:g} steps per second, but the world {self._task.world} makes "
-                f"{self._rate:g}: each action would last a different time"
+                f"{own:g}: each action would last a different time"
             )
 
     def _is_instruction(self, words: str) -> bool:

@@ -1,4 +1,4 @@
-"""The definitions of the project's scenarios, and the comparison of a record's definition with another."""
+"""The definitions of the project's scenarios, which a file pins."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 from clbench.base.strict_json import read_json
 
@@ -19,56 +18,7 @@ def pinned_file() -> Path:
     return Path(envs.origin).with_name("definitions.json")
 
 
-LATER = ("rule ", "camera")
-"""Prefixes of the names of parts that the first definitions lacked."""
-
-
 @cache
 def pinned() -> Mapping[str, Mapping[str, str]]:
     """Return the definition of each scenario of the project, see `clbench.evaluation.definition`."""
     return {**read_json(pinned_file())}
-
-
-def other_parts(recorded: Any, known: Mapping[str, str]) -> list[str]:
-    """Return the parts of the definition `known` that `recorded` defines differently.
-
-    Args:
-        recorded: `fingerprint["definition"]` of a record, which a stranger may have written. None in a record
-            that is older than definitions: it is not known to differ.
-        known: The definition to compare with, which names all parts. Parts of `LATER` that one of the two
-            lacks are not known to differ.
-    """
-    if recorded is None:
-        return []
-    if not isinstance(recorded, dict):
-        return ["the tasks themselves"]
-    later = {name for name in recorded.keys() ^ known.keys() if name.startswith(LATER)}
-    if recorded.keys() - known.keys() - later:
-        return ["the tasks themselves"]
-    return [name for name in known if name not in later and recorded.get(name) != known[name]]
-
-
-def other_versions(recorded: Any, installed: Mapping[str, str]) -> list[str]:
-    """Return in words which packages have other versions than in a record: "mujoco was 3.1 and is 3.2".
-
-    Args:
-        recorded: `fingerprint["versions"]` of a record, which a stranger may have written. A package that it
-            lacks is not known to differ.
-        installed: Versions by package.
-    """
-    before = recorded if isinstance(recorded, dict) else {}
-    return [
-        f"{name} was {before[name]} and is {version}"
-        for name, version in installed.items()
-        if before.get(name, version) != version
-    ]
-
-
-def machine_of(fingerprint: Mapping[str, Any]) -> str | None:
-    """Return the kind of processor in a fingerprint, None if it names no known kind.
-
-    MuJoCo's builds for ARM fuse multiplications and additions, so that some worlds move differently there.
-    """
-    hardware = fingerprint.get("hardware")
-    found = hardware.get("machine") if isinstance(hardware, dict) else None
-    return found if found in ("x86_64", "AMD64", "aarch64", "arm64") else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +75,7 @@ def home_of(run: RunInfo) -> Path:
     """Return the path that the record of a run has below its folder of records.
 
     Raises:
-        RecordError: A name, the seed or the order is impossible.
+        RecordError: A name or the seed is impossible.
     """
     if run.seed < 0:
         raise RecordError(f"run: {run.seed} cannot be a seed.")
@@ -94,7 +94,7 @@ def check_home(run: RunInfo, path: Path, records: Path | None = None) -> Path:
         records: Folder of the records; if None, `path` only has to end with the place.
 
     Raises:
-        RecordError: The record is at another place, or a name, the seed or the order is impossible.
+        RecordError: The record is at another place, or a name or the seed is impossible.
     """
     home = home_of(run)
     if home.parts != (path.relative_to(records).parts if records else path.parts[-len(home.parts) :]):
@@ -124,10 +124,10 @@ def _record(values: Any) -> Record:
     _check_error(record)
     if schema >= FIRST_DEFINED and record.status == "success":
         _check_definition(record, schema)
-    _check_columns("episodes", record.episodes, EPISODE_COLUMNS)
-    _check_columns("answers", record.answers, AnswerRow._fields)
-    _check_columns("policy", record.policy, PolicyRow._fields)
-    _check_columns("checks", record.checks, CheckRow._fields)
+    record.episodes = _table("episodes", record.episodes, EPISODE_COLUMNS)
+    record.answers = _table("answers", record.answers, AnswerRow._fields)
+    record.policy = _table("policy", record.policy, PolicyRow._fields)
+    record.checks = _table("checks", record.checks, CheckRow._fields)
     scenario = record.scenario
     _check_names("task", (*scenario.retained, *scenario.target, *scenario.held_out))
     _check_names("kind of question", set(record.answers["kind"]))
@@ -200,17 +200,21 @@ def _check_order(record: Record) -> None:
         raise RecordError("run: order must be 0: each seed of its scenario has an order of its own.")
 
 
-def _check_columns(name: str, table: dict[str, Any], columns: Iterable[str]) -> None:
-    if tuple(table) != tuple(columns):
+def _table(name: str, table: dict[str, Any], columns: Sequence[str]) -> dict[str, list[Any]]:
+    """Return a table with its columns in order, after checking them."""
+    if table.keys() != set(columns):
         raise RecordError(f"{name} must have the columns {', '.join(columns)}.")
-    lengths = {len(column) if isinstance(column, list) else -1 for column in table.values()}
-    if len(lengths) != 1 or -1 in lengths:
+    for column, values in table.items():
+        if not isinstance(values, list):
+            raise RecordError(f"{name}: {column} must be a list.")
+        if {list, dict} & set(map(type, values)):
+            raise RecordError(f"{name}: {column} must not hold lists or objects.")
+    lengths = set(map(len, table.values()))
+    if len(lengths) != 1:
         raise RecordError(f"the columns of {name} have different lengths.")
     if max(lengths) > MOST_ROWS:
         raise RecordError(f"{name} has {max(lengths):,} rows, more than {MOST_ROWS:,}.")
-    for column, values in table.items():
-        if {list, dict} & set(map(type, values)):
-            raise RecordError(f"{name}: {column} must not hold lists or objects.")
+    return {column: table[column] for column in columns}
 
 
 def _check_names(kind: str, names: Iterable[Any]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, get_args
 
 from clbench.records.paths import label_of
+from clbench.spec.protocol import Point
 from clbench.spec.scenario import Group
 
 if TYPE_CHECKING:
@@ -56,15 +57,17 @@ def matrix(record: Record) -> pandas.DataFrame:
     """Return the success rates at the ends of stages: a row for each stage, a column for each task.
 
     The first row is "pretrained", before any target; the others have the names of the targets in the order in
-    which the run learned them. Columns have two levels, the group and the task. Only the scored split counts:
-    test episodes or, in a tuning run, validation episodes.
+    which the run learned them. A stage that a failed run did not finish has no row. Columns have two levels,
+    the group and the task. Only the scored split counts: test episodes or, in a tuning run, validation
+    episodes.
     """
     import pandas
 
     found = frame(record)
     found = found[found.split == record.run.split]
-    ends = found.groupby("stage").step.transform("max")
-    rates = found[found.step == ends].groupby(["stage", "task"]).success.mean().unstack("task")
+    protocol = record.scenario.protocol(record.run.split)
+    ends = [protocol.is_end(Point(*point)) for point in zip(found.stage, found.step, strict=True)]
+    rates = found.loc[ends].groupby(["stage", "task"]).success.mean().unstack("task")
     columns = [(group, task) for group in GROUPS for task in getattr(record.scenario, group)]
     rates = rates.reindex(columns=[task for _, task in columns])
     rates.columns = pandas.MultiIndex.from_tuples(columns, names=("group", "task"))

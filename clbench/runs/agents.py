@@ -1,9 +1,9 @@
-"""Online learning: an agent from any library learns a scenario by trial and error, and leaves a record.
+"""Runs whose policy another program trains: agents that learn online, and served policies.
 
-The agent brings its own loop: it trains in the environment of one stage after another, and is evaluated after
-each, on the same test episodes with the same initial states as every run. Its record has no answers to
-questions, no evaluation points within a stage, and no count of optimiser steps. Until the last stage ends,
-the record is kept beside its final path: an interrupted program loses only the stage that was running.
+Each stage is evaluated on the same test episodes with the same initial states as in every run. The records
+have no answers to questions, no evaluation points within a stage, and no count of optimiser steps. Until the
+last stage ends, the record is kept beside its final path: an interrupted program loses only the stage that
+was running.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
-from importlib.metadata import packages_distributions, version
 from pathlib import Path
 from typing import Any
 
@@ -23,19 +22,19 @@ import torch
 
 from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError, WrongTypeError
-from clbench.base.lease import Lease
+from clbench.base.lease import Lease, LeaseLostError
 from clbench.base.seeding import seeded
 from clbench.base.strict_json import check_json
 from clbench.data.demonstrations import simulator_versions
 from clbench.evaluation.episodes import Episode, Trial
 from clbench.evaluation.examiner import episode_row
 from clbench.evaluation.players import Agent, TrainingEnv, acts_on_batches, play, training_of
+from clbench.records.fingerprints import other_parts, other_versions
 from clbench.records.paths import RECORDS, record_path
-from clbench.records.pinned import other_parts, other_versions
 from clbench.records.reader import RecordError, UnreadableRecordError, read_record
 from clbench.records.record import ONLINE_USES, AnswerRow, Record, RunInfo
 from clbench.records.writer import write_record
-from clbench.runs.fingerprint import fingerprint
+from clbench.runs.fingerprint import describe_agent, fingerprint
 from clbench.runs.spec import describe_scenario
 from clbench.spec.fields import is_whole, whole_number
 from clbench.spec.identifiers import built_in_methods, check_method_name
@@ -97,7 +96,8 @@ def evaluate_agent(
             the scenario or its simulator, an action has the wrong shape, an agent of Stable-Baselines3 was
             trained behind a wrapper that changes observations or actions, or the name, the seed, the steps
             or the settings are invalid.
-        LeaseLostError: Another program took over the run, because this one did not respond.
+        RecordError: The record of the earlier stages cannot be read.
+        LeaseLostError: Another program took over the run, or the file of its lease was removed.
     """
     training = training_of(env)
     scenario, stage = training.scenario, training.stage
@@ -112,7 +112,7 @@ def evaluate_agent(
         raise WrongTypeError(
             f"{type(agent).__name__} is not an agent: it has no predict() and cannot be called."
         )
-    stage, steps = int(stage), whole_number("steps", steps, 0)
+    stage, steps = int(stage), None if steps is None else whole_number("steps", steps, 0)
     run = StagedRun(scenario, method, seed, Path(records), ONLINE_USES)
     begin = time.perf_counter()
     trained = begin - training.begun_at if steps is None and training.begun_at is not None else None
@@ -142,6 +142,7 @@ def next_stage(scenario: str, *, method: str, seed: int = 0, records: Path | str
 
     Raises:
         InputError: The record is of a served policy, or its scenario or simulator is another version.
+        RecordError: The record cannot be read.
     """
     run = StagedRun(load_scenario(scenario), method, seed, Path(records), ONLINE_USES)
     return run.next_after(run.kept())
@@ -276,7 +277,7 @@ class StagedRun:
             told = f"{self} already has a record, {self.path}, which is never edited"
             raise InputError(f"{told}: choose another seed or name, or delete the record.")
 
-    def plan(self, stage: int, again: bool) -> Record | None:
+    def record_before(self, stage: int, again: bool) -> Record | None:
         """Return the record so far, after checking that a stage comes next or has been evaluated.
 
         Args:
@@ -307,7 +308,15 @@ class StagedRun:
                     raise InputError(f"{told}: choose another name or seed, or wait until it is done.")
                 time.sleep(1.0)  # the lease of a dead process on another machine is watched for a while
             _LEASES[self.unfinished] = lease
-        _LEASES[self.unfinished].check()
+        self._check_lease()
+
+    def _check_lease(self) -> None:
+        """Refuse to go on without the lease; a lost one is given up, so that the next call can take it."""
+        try:
+            _LEASES[self.unfinished].check()
+        except LeaseLostError:
+            self._release()
+            raise
 
     def begin(self, stage: int, settings: dict[str, Any] | None, agent: Any, again: bool) -> Record:
         """Take the lease of the run, and return the record of the earlier stages.
@@ -320,8 +329,9 @@ class StagedRun:
 
         Raises:
             InputError: Another stage comes next, settings differ from those in stage 0, or another process
-                has taken the run; also as for `plan`.
-            LeaseLostError: Another process took over the run.
+                has taken the run; also as for `record_before`.
+            RecordError: As for `record_before`.
+            LeaseLostError: The run is no longer this process's; the next call takes it again if it is free.
         """
         owned = self.unfinished in _LEASES
         try:
@@ -335,7 +345,7 @@ class StagedRun:
 
     def _begun(self, stage: int, settings: dict[str, Any] | None, agent: Any, again: bool) -> Record:
         self.check_unfinished()  # also for a process that has just finished the run
-        record = self.plan(stage, again)
+        record = self.record_before(stage, again)
         following = self.next_after(record)
         if stage < following and not again:
             raise InputError(
@@ -369,7 +379,7 @@ class StagedRun:
             uses=dict(self.uses),
         )
         record = Record("success", run, describe_scenario(self.scenario))
-        record.fingerprint = {**self._fingerprint, "method": _describe(agent)}
+        record.fingerprint = {**self._fingerprint, "method": describe_agent(agent)}
         record.timing = {"started": datetime.now(UTC).isoformat(timespec="seconds"), "stages": []}
         return record
 
@@ -411,9 +421,9 @@ class StagedRun:
         """Write the record: beside its final path, or after the last stage to that path, which ends the run.
 
         Raises:
-            LeaseLostError: Another process took over the run.
+            LeaseLostError: As for `begin`; the stage is not kept.
         """
-        _LEASES[self.unfinished].check()
+        self._check_lease()
         if stage < self.last:
             write_record(record, self.unfinished)
             return
@@ -424,16 +434,6 @@ class StagedRun:
     def _release(self) -> None:
         if lease := _LEASES.pop(self.unfinished, None):
             lease.release()
-
-
-def _describe(agent: Any) -> dict[str, Any]:
-    """Return the class of an agent and the version of its package, None if it has no package."""
-    kind = type(agent)
-    packages = packages_distributions().get(kind.__module__.partition(".")[0], [])
-    return {
-        "class": f"{kind.__module__}:{kind.__qualname__}",
-        "version": version(packages[0]) if packages else None,
-    }
 
 
 def _checked_settings(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import os
 import platform
 import subprocess
 from functools import lru_cache
+from importlib.metadata import packages_distributions, version
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +96,16 @@ def describe_policy(scenario: Scenario, seed: int) -> dict[str, str | None]:
 
     weights = pretraining_inputs(scenario, seed).get("weights")
     return {"policy": source, **({"weights": weights} if weights else {})}
+
+
+def describe_agent(agent: Any) -> dict[str, Any]:
+    """Return the class of an agent and the version of its package, None if it has no package."""
+    kind = type(agent)
+    packages = packages_distributions().get(kind.__module__.partition(".")[0], [])
+    return {
+        "class": f"{kind.__module__}:{kind.__qualname__}",
+        "version": version(packages[0]) if packages else None,
+    }
 
 
 def _commit() -> dict[str, Any] | None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import shutil
 import time
 import traceback
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -31,7 +33,7 @@ from clbench.records.reader import read_record
 from clbench.records.record import Costs, Record
 from clbench.records.writer import check_diagnostics, write_record, write_result
 from clbench.runs.fingerprint import arithmetic, describe_policy, fingerprint
-from clbench.runs.length import relearning_length, relearns, run_length
+from clbench.runs.length import relearning_length, relearns, run_length, watching_length
 from clbench.runs.relearning import relearn
 from clbench.runs.spec import ResolvedRun, RunSpec
 from clbench.runs.stages import NOT_THE_METHOD, drop_stages, keep_stage, keeps_stage, machine_needed
@@ -60,7 +62,7 @@ def execute(
         run: The run, by name or resolved.
         records: Folder of the records.
         progress: Called with the length of the work done since its last call, in optimiser steps;
-            `clbench.runs.length.run_length` returns the total.
+            `run_length` and `watching_length` of `clbench.runs.length` add up to the total.
         checkpoints: Folder below which the policies of all stages are kept; None keeps none.
         tensorboard: Folder below which the run is logged for TensorBoard; None logs nothing.
 
@@ -140,6 +142,14 @@ def _bytes(value: torch.Tensor | str | float | bool | None) -> int:
     if isinstance(value, str):
         return len(value.encode())
     return 0 if value is None or isinstance(value, bool) else 8
+
+
+@contextlib.contextmanager
+def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    """Add the seconds that the block takes to those under a name."""
+    begin = time.perf_counter()
+    yield
+    seconds[name] += time.perf_counter() - begin
 
 
 @dataclasses.dataclass
@@ -271,23 +281,19 @@ class _Run:
         *on_the_way, _ = protocol.points(number)
         points = set() if self.trainer.method.whole_stages else set(on_the_way)
         predictions = self.examiner.predictions(self.trainer.policy, number)
-        begin, evaluating, checking = time.perf_counter(), 0.0, 0.0
+        begin, seconds = time.perf_counter(), {"training": 0.0, "checks": 0.0, "evaluation": 0.0}
 
         def evaluate(point: Point, before: torch.Tensor | None = None) -> None:
-            nonlocal evaluating
-            paused = time.perf_counter()
-            self.examiner.examine(self.trainer.policy, point, self.record, before)
-            self.log.report(self.record, point)
-            evaluating += time.perf_counter() - paused
+            with _timed(seconds, "evaluation"):
+                self.examiner.examine(self.trainer.policy, point, self.record, before)
+                self.log.report(self.record, point)
 
         def is_learned(point: Point) -> bool:
-            nonlocal checking
-            paused = time.perf_counter()
-            row = self.checker.check(self.trainer.finished(), self.run.scenario.target[number - 1], point)
-            self.record.add_check(row)
-            announce(self.trainer.where, f"{row.successes}/{row.episodes} after {point.step} steps")
-            checking += time.perf_counter() - paused
-            return self.checker.is_learned(row)
+            with _timed(seconds, "checks"):
+                row = self.checker.check(self.trainer.finished(), self.run.scenario.target[number - 1], point)
+                self.record.add_check(row)
+                announce(self.trainer.where, f"{row.successes}/{row.episodes} after {point.step} steps")
+                return self.checker.is_learned(row)
 
         def after(step: Step) -> bool:
             point = Point(number, step.done)
@@ -299,12 +305,12 @@ class _Run:
             return self.checker.is_due(point) and is_learned(point)
 
         steps = self.trainer.learn(number, after)
-        self.progress(protocol.steps[-1] - steps if protocol.criterion else 0)
-        evaluate(Point(number, steps) if protocol.criterion else protocol.end(number), predictions)
+        if protocol.criterion is not None:
+            self.progress(protocol.steps[-1] - steps)
+        evaluate(protocol.end(number) if protocol.criterion is None else Point(number, steps), predictions)
         self._diagnose(number)
-        training = time.perf_counter() - begin - evaluating - checking
+        seconds["training"] = time.perf_counter() - begin - sum(seconds.values())
         self._count_steps(steps + self.trainer.extra_steps)
-        seconds = {"training": training, "checks": checking, "evaluation": evaluating}
         self.record.timing["stages"].append({name: round(value, 2) for name, value in seconds.items()})
 
     def _relearn(self) -> None:
@@ -380,7 +386,8 @@ class _Run:
             self.seconds_before = self.record.timing["seconds"]
             self.record.timing["resumed_after"] = number
             length = run_length(self.run.scenario, self.run.protocol) - relearning_length(self.run.protocol)
-            self.progress(number * length / max(targets, 1))
+            watched = watching_length(self.run.method, self.run.scenario)
+            self.progress(watched + number * length / max(targets, 1))
             return number
         return None
 

@@ -182,7 +182,7 @@ class ResolvedRun:
     @property
     def label(self) -> str:
         """The method with its changed hyper-parameters, for example "experience_replay+replay=0.02"."""
-        return label_of(self.spec.method, self.changes)
+        return label_of(self.spec.method, self.info.changes)
 
     def path(self, records: Path) -> Path:
         """Return the path of the record below the folder `records`."""

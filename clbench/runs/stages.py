@@ -32,6 +32,7 @@ from clbench.policy.checkpoint import CheckpointError
 from clbench.policy.policy import Policy
 from clbench.records.paths import stage_folder
 from clbench.runs.fingerprint import arithmetic
+from clbench.runs.length import watching_length
 from clbench.spec.protocol import Point
 from clbench.worlds.gl_backend import RenderingError
 
@@ -168,7 +169,7 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
             if number:
                 trainer.load(stage_folder(root, number - 1), number - 1)
                 steps = trainer.learn(number, after)
-                progress(scenario.budget.adaptation_steps - steps if scenario.budget.criterion else 0)
+                progress(0 if scenario.budget.criterion is None else scenario.budget.adaptation_steps - steps)
             else:
                 trainer.prepare(progress)
             trainer.save(folder, trainer.state(number))
@@ -179,7 +180,9 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
         for number in range(len(scenario.target) + 1):
             folder, identity = stage_folder(root, number), _identity(run, number)
             if is_cached(folder, identity):
-                progress(scenario.budget.adaptation_steps if number else 0)
+                progress(
+                    scenario.budget.adaptation_steps if number else watching_length(run.method, scenario)
+                )
             else:
                 cached(folder, identity, functools.partial(make, number))
     return root

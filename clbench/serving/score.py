@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,7 +19,7 @@ from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import seeded
 from clbench.base.text import printable
 from clbench.evaluation.players import ChunkPlay, ChunkPolicy, play_chunks
-from clbench.evaluation.views import SIZE, Views
+from clbench.evaluation.views import SIZE, SimulatorCameras
 from clbench.records.paths import RECORDS
 from clbench.records.reader import RecordError, read_record
 from clbench.records.record import EXTERNAL_USES, Record
@@ -56,15 +55,17 @@ def is_scored(
     Raises:
         InputError: An earlier stage comes first, there is no such stage, the stage was scored with other
             `executed`, `data`, `steps` or `pictures`, or `score` would refuse it for another reason.
+        RecordError: The record of the earlier stages cannot be read.
     """
     run = StagedRun(load_scenario(scenario), method, seed, Path(records), EXTERNAL_USES)
     if restart:
         run.check_unfinished()
-    record = run.plan(stage, restart)
+    record = run.record_before(stage, restart)
     if restart or record is None or stage == run.next_after(record):
         return False
     kept = {**record.run.settings, **record.diagnostics.get(str(stage), {})}
-    settings = {"executed": executed, "data": data, "steps": steps, **Views(pictures, picture_size).settings}
+    cameras = SimulatorCameras(pictures, picture_size)
+    settings = {"executed": executed, "data": data, "steps": steps, **cameras.settings}
     for name, value in settings.items():
         if value is not None and kept.get(name) != value:
             hint = (
@@ -125,23 +126,26 @@ def score(
         InputError: Another stage comes next, a record exists already, `executed` differs from stage 0, the
             earlier stages had another version of the scenario or its simulator, or other pictures, the
             actions have the wrong shape, or a name or number is invalid.
+        RecordError: The record of the earlier stages cannot be read.
+        LeaseLostError: Another program took over the run, or the file of its lease was removed.
         UnknownNameError: A scene has no such camera.
         RenderingError: This machine cannot draw the pictures.
         WrongTypeError: `data` is not a text.
     """
-    executed, steps = whole_number("executed", executed, 1), whole_number("steps", steps, 0)
+    executed = None if executed is None else whole_number("executed", executed, 1)
+    steps = None if steps is None else whole_number("steps", steps, 0)
     stage = int(stage) if is_whole(stage) else stage  # of NumPy, which JSON cannot hold
     if data is not None and not isinstance(data, str):
         raise WrongTypeError(f"data must be a string, not {data!r}.")
     run = StagedRun(load_scenario(scenario), method, seed, Path(records), EXTERNAL_USES)
     begin = time.perf_counter()
-    views = Views(pictures, picture_size)
-    record = run.begin(stage, _settings(run, stage, restart, executed, views), policy, restart)
+    cameras = SimulatorCameras(pictures, picture_size)
+    record = run.begin(stage, _settings(run, stage, restart, executed, cameras), policy, restart)
     server = _kept_metadata(getattr(policy, "metadata", {}))
     if server:
         _warn_if_known(server, record, run, stage)
     trials = run.trials(stage)
-    with seeded("external evaluation", seed, stage), contextlib.closing(views):
+    with seeded("external evaluation", seed, stage), contextlib.closing(cameras):
         played = play_chunks(
             policy,
             run.scenario,
@@ -150,12 +154,12 @@ def score(
             record.run.settings.get("executed"),
             whole=executed is None,
             progress=lambda count: progress(count / len(trials)),
-            views=views if views.cameras else None,
+            cameras=cameras if cameras.names else None,
         )
     _warn(stage, played)
     run.report(record, stage, played.episodes)
     _warn_if_unchanged(record, stage)
-    record.run.settings = {"executed": played.executed, **views.settings}
+    record.run.settings = {"executed": played.executed, **cameras.settings}
     declared = {"data": data, "steps": steps, "server": server or None}
     record.diagnostics[str(stage)] = {
         **{name: value for name, value in declared.items() if value is not None},
@@ -168,12 +172,12 @@ def score(
 
 
 def _settings(
-    run: StagedRun, stage: int, restart: bool, executed: int | None, views: Views
+    run: StagedRun, stage: int, restart: bool, executed: int | None, cameras: SimulatorCameras
 ) -> dict[str, Any] | None:
     """Return the settings of a stage: pictures come from this call, `executed` may come from stage 0."""
-    before = run.plan(stage, restart) if stage else None
+    before = run.record_before(stage, restart) if stage else None
     known = before.run.settings.get("executed") if before else None
-    chosen = {"executed": known if executed is None else executed, **views.settings}
+    chosen = {"executed": known if executed is None else executed, **cameras.settings}
     return {name: value for name, value in chosen.items() if value is not None} or None
 
 
@@ -236,7 +240,7 @@ def _kept_metadata(metadata: object) -> dict[str, Any]:
         found = value.item() if isinstance(value, np.generic) else value
         if isinstance(found, str):
             found = printable(found)[:LONGEST_METADATA]
-        elif not isinstance(found, int | float) or not math.isfinite(found) or abs(found) >= 2**63:
+        elif not isinstance(found, int | float) or not abs(found) < 2**63:  # nor is NaN
             continue
         plain[printable(str(name))[:LONGEST_METADATA]] = found
     return dict(list(plain.items())[:MOST_METADATA])

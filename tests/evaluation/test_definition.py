@@ -13,7 +13,8 @@ from helpers import scenario_or_skip
 from clbench.base.errors import InputError
 from clbench.evaluation.definition import definition
 from clbench.jobs.recorded import has_record
-from clbench.records.pinned import other_parts, pinned
+from clbench.records.fingerprints import other_parts
+from clbench.records.pinned import pinned
 from clbench.records.reader import read_record
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec

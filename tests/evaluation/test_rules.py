@@ -10,7 +10,7 @@ import pytest
 
 from clbench.evaluation.definition import definition
 from clbench.evaluation.rules import rule_code
-from clbench.records.pinned import other_parts
+from clbench.records.fingerprints import other_parts
 from clbench.spec.registry import load_scenario
 from clbench.testing import TOY
 
@@ -117,6 +117,23 @@ def test_a_value_counts_wherever_a_rule_uses_it(near: str, module: Callable[[str
         world = module(name, source.replace("NEAR = 0.3", f"NEAR = {limit}"))
         codes.append(rule_code(dataclasses.replace(TOY.retained[0], world=f"{world}:World")))
     assert codes[0] == codes[1] != codes[2]
+
+
+@pytest.mark.parametrize(
+    "member",
+    [
+        "    @functools.cached_property\n    def limit(self):\n        return NEAR\n",
+        "    def within(self, limit):\n        return limit\n"
+        "    limit = functools.partialmethod(within, NEAR)\n",
+        "    @functools.singledispatchmethod\n    def limit(self, one):\n        return one < NEAR\n",
+    ],
+)
+def test_a_value_counts_in_every_kind_of_member(member: str, module: Callable[[str, str], str]) -> None:
+    source = f"import functools\nNEAR = 0.3\nclass World:\n{member}"
+    codes = []
+    for name, text in (("one_world", source), ("other_world", source.replace("0.3", "0.30001"))):
+        codes.append(rule_code(dataclasses.replace(TOY.retained[0], world=f"{module(name, text)}:World")))
+    assert codes[0] != codes[1]
 
 
 @pytest.mark.parametrize(

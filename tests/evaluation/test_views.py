@@ -11,7 +11,7 @@ import pytest
 from clbench.base.errors import ClbenchError, InputError, UnknownNameError
 from clbench.evaluation.episodes import LANES, Trial
 from clbench.evaluation.players import play_chunks
-from clbench.evaluation.views import Views
+from clbench.evaluation.views import SimulatorCameras
 from clbench.spec.registry import load_scenario
 from clbench.testing import TOY
 from clbench.worlds.lanes import Lanes
@@ -30,14 +30,16 @@ def lanes() -> Iterator[Lanes]:
 
 
 @pytest.fixture
-def views() -> Iterator[Views]:
-    views = Views(CAMERAS, size=48)
-    yield views
-    views.close()
+def cameras() -> Iterator[SimulatorCameras]:
+    cameras = SimulatorCameras(CAMERAS, size=48)
+    yield cameras
+    cameras.close()
 
 
-def test_the_pictures_of_a_lane_are_those_that_mujoco_draws_of_it_upright(lanes: Lanes, views: Views) -> None:
-    drawn = [views.draw(lanes, lane, TASK) for lane in (0, 1)]
+def test_the_pictures_of_a_lane_are_those_that_mujoco_draws_of_it_upright(
+    lanes: Lanes, cameras: SimulatorCameras
+) -> None:
+    drawn = [cameras.draw(lanes, lane, TASK) for lane in (0, 1)]
     world: Any = lanes.world(TASK)
     for lane, pictures in enumerate(drawn):
         model, data, _ = world.drawable(lane)
@@ -51,14 +53,14 @@ def test_the_pictures_of_a_lane_are_those_that_mujoco_draws_of_it_upright(lanes:
     assert not np.array_equal(first, second)
 
 
-def test_drawing_changes_no_step(lanes: Lanes, views: Views) -> None:
+def test_drawing_changes_no_step(lanes: Lanes, cameras: SimulatorCameras) -> None:
     other = Lanes(2)
     other.reset([0, 1], [3, 4], [TASK, TASK])
     generator = np.random.default_rng(0)
     for _ in range(5):
         actions = generator.uniform(-1, 1, (2, 4)).astype(np.float32)
         for lane in (0, 1):
-            views.draw(lanes, lane, TASK)
+            cameras.draw(lanes, lane, TASK)
         (found, *_), (expected, *_) = (some.step([0, 1], actions) for some in (lanes, other))
         assert np.array_equal(found, expected)
     other.close()
@@ -80,7 +82,7 @@ def test_a_picture_that_the_scene_does_not_have_is_refused(
     cameras: list[str], size: int, error: type[ClbenchError], message: str
 ) -> None:
     with pytest.raises(error, match=message):
-        Views(cameras, size).check([TASK])
+        SimulatorCameras(cameras, size).check([TASK])
 
 
 @pytest.mark.parametrize(
@@ -90,20 +92,21 @@ def test_a_picture_that_the_scene_does_not_have_is_refused(
         ([1], 48, InputError, "each named once"),
         (["lidar"], 0, InputError, "picture_size must be a whole number"),
         (["lidar"], "48", InputError, "picture_size must be a whole number"),
+        (["lidar"], None, InputError, "picture_size must be a whole number from 1, not None"),
     ],
 )
 def test_cameras_and_sizes_that_mean_nothing_are_refused(
     cameras: Any, size: Any, error: type[ClbenchError], message: str
 ) -> None:
     with pytest.raises(error, match=message):
-        Views(cameras, size)
+        SimulatorCameras(cameras, size)
 
 
 def test_a_world_that_nobody_can_draw_is_named() -> None:
     task = TOY.target[0]
     message = f"{task.name!r} has no pictures: the vector world of .*ToyWorld has no drawable"
     with pytest.raises(InputError, match=message):
-        Views(["front"]).check([task])
+        SimulatorCameras(["front"]).check([task])
 
 
 def test_a_policy_that_acts_on_a_real_scene_gets_its_pictures() -> None:
@@ -115,8 +118,8 @@ def test_a_policy_that_acts_on_a_real_scene_gets_its_pictures() -> None:
         seen.append(observations)
         return np.zeros((LANES, TASK.horizon, 4))
 
-    with closing(Views(CAMERAS, 32)) as views:
-        play_chunks(act, scenario, trials, 0, views=views)
+    with closing(SimulatorCameras(CAMERAS, 32)) as cameras:
+        play_chunks(act, scenario, trials, 0, cameras=cameras)
     (observations,) = seen
     pictures = observations["pictures/external_camera_0"]
     assert (pictures.shape, pictures.dtype.name) == ((LANES, 32, 32, 3), "uint8")
@@ -126,9 +129,9 @@ def test_a_policy_that_acts_on_a_real_scene_gets_its_pictures() -> None:
 
 def test_scenes_without_a_common_camera_are_refused() -> None:
     with pytest.raises(InputError, match="no camera 'fixed': the scenes of the tasks share no camera"):
-        Views(["fixed"]).check(load_scenario("clbench/DMControl-v0").retained)
+        SimulatorCameras(["fixed"]).check(load_scenario("clbench/DMControl-v0").retained)
 
 
 def test_without_a_camera_a_record_keeps_no_setting() -> None:
-    assert Views(()).settings == {}
-    assert Views(["agentview"]).settings == {"pictures": ["agentview"], "picture_size": 224}
+    assert SimulatorCameras(()).settings == {}
+    assert SimulatorCameras(["agentview"]).settings == {"pictures": ["agentview"], "picture_size": 224}

@@ -20,6 +20,7 @@ from clbench.data.demonstrations import Demonstrations, dataset_folder, read_dat
 from clbench.exchange.hdf5 import read_hdf5
 from clbench.spec.task import Task
 from clbench.testing import TOY
+from clbench.testing import toy as toy_module
 
 TASK = TOY.task("right")
 CAMERA = "clbench.testing.toy_camera:ToyCamera"
@@ -288,6 +289,27 @@ def test_what_does_not_fit_is_named(edit: Callable[[h5py.Group], None], message:
         edit(file["data"])
     with pytest.raises(InputError, match=f"^{exported}: .*{message}"):
         read_hdf5(exported, TASK)
+
+
+class _OwnRate(toy_module.ToyWorld):
+    """A toy whose task "right" has 5 steps per second, as its metadata say after the reset."""
+
+    def reset(self, **arguments: Any) -> Any:
+        self.metadata = {**self.metadata, "render_fps": 5}
+        return super().reset(**arguments)
+
+
+@pytest.mark.parametrize(("rate", "fits"), [(5, True), (10, False)])
+def test_a_file_must_have_the_rate_of_its_task_in_the_world(
+    rate: float, fits: bool, exported: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(toy_module, "OwnRate", _OwnRate, raising=False)
+    task = dataclasses.replace(TASK, world="clbench.testing.toy:OwnRate")
+    with h5py.File(exported, "r+") as file:
+        _attribute("env_args", json.dumps({"env_kwargs": {"control_freq": rate}}))(file["data"])
+    expected = nullcontext() if fits else pytest.raises(InputError, match=r"at 10 steps .* makes 5: each")
+    with expected:
+        read_hdf5(exported, task)
 
 
 def test_an_instruction_counts_as_a_policy_reads_it(exported: Path) -> None:

@@ -169,11 +169,18 @@ def test_columns_that_do_not_fit_together_are_refused_by_name(
     columns = getattr(record, name)
     unequal = {**columns, "stage": columns["stage"][1:]}
     foreign = {**columns, "reward": columns["stage"]}
-    tables: tuple[Any, ...] = (unequal, foreign, {}, None, [], dict.fromkeys(columns, 1))
-    for table in tables:
+    tables: tuple[tuple[Any, str], ...] = (
+        (unequal, f"the columns of {name} have different lengths"),
+        (foreign, f"{name} must have the columns stage, step"),
+        ({}, f"{name} must have the columns stage, step"),
+        (None, name),
+        ([], name),
+        (dict.fromkeys(columns, 1), f"{name}: stage must be a list"),
+    )
+    for table, words in tables:
         write_record(record, path)
         change(path, **{name: table})
-        with pytest.raises(RecordError, match=name):
+        with pytest.raises(RecordError, match=words):
             read_record(path)
 
 
@@ -218,14 +225,15 @@ def test_a_record_without_its_hash_is_refused(record: Record, tmp_path: Path) ->
         read_record(path)
 
 
-def test_a_record_may_be_indented_and_its_settings_reordered(record: Record, tmp_path: Path) -> None:
+def test_a_record_may_be_indented_and_all_its_entries_reordered(record: Record, tmp_path: Path) -> None:
     record.run.settings = {"strength": 0.1, "name": "naïve"}
     path = tmp_path / "record.json"
     write_record(record, path)
     values = json.loads(path.read_text(encoding="utf-8"))
-    values["run"]["settings"] = dict(reversed(values["run"]["settings"].items()))
-    path.write_text(json.dumps(values, indent=4, ensure_ascii=False), encoding="utf-8")
-    assert read_record(path) == record
+    path.write_text(json.dumps(values, indent=4, ensure_ascii=False, sort_keys=True), encoding="utf-8")
+    found = read_record(path)
+    assert found == record
+    assert found.episode_rows() == record.episode_rows()
 
 
 def test_success_at_the_start_counts_the_scored_episodes_of_the_retained_skills_alone(

@@ -70,3 +70,18 @@ def test_the_table_of_a_run_that_failed_at_once_is_empty(make_record: Callable[.
         column.clear()
     assert isinstance(record.frame(), pandas.DataFrame)
     assert record.frame().empty
+
+
+def test_the_matrix_of_a_failed_run_has_no_row_for_a_stage_that_did_not_end(
+    make_record: Callable[..., Record],
+) -> None:
+    rates, on_the_way = np.full((3, 4), 0.5), np.ones((2, 3))
+    record = make_record(rates, curves=on_the_way, episodes=4)
+    ended = [row for row in record.episode_rows() if (row.stage, row.step) != (2, 400)]
+    for column, values in zip(record.episodes.values(), zip(*ended, strict=True), strict=True):
+        column[:] = values
+    assert max(record.episodes["stage"]) == 2
+    assert list(record.matrix().index) == ["pretrained", "target_0"]
+    for column in record.episodes.values():
+        column.clear()
+    assert record.matrix().empty

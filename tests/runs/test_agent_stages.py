@@ -240,3 +240,26 @@ def test_a_stage_of_a_process_that_lost_its_lease_is_not_kept(
     with pytest.raises(LeaseLostError):
         evaluate(act, stage_env(0))
     assert not list((tmp_path / "records").rglob("*.unfinished"))
+
+
+def test_a_run_whose_lease_was_lost_can_be_taken_again(evaluate: Callable[..., Any], tmp_path: Path) -> None:
+    evaluate(Knowing(), stage_env(0))
+    shutil.rmtree(tmp_path / "records")
+    with pytest.raises(LeaseLostError):
+        evaluate(Knowing(), stage_env(0))
+    evaluate(Knowing(), stage_env(0))
+    assert next_stage(ID, method="me/knows", records=tmp_path / "records") == 1
+
+
+def test_a_stage_that_was_not_kept_can_be_evaluated_again(
+    evaluate: Callable[..., Any], tmp_path: Path
+) -> None:
+    def act(observation: object) -> list[int]:
+        for lease in (tmp_path / "records").rglob(".*.lease"):
+            lease.unlink()
+        return [0, 0]
+
+    evaluate(Knowing(), stage_env(0))
+    with pytest.raises(LeaseLostError):
+        evaluate(act, stage_env(1))
+    assert set(evaluate(Knowing(), stage_env(1)).episodes["stage"]) == {0, 1}

@@ -231,7 +231,7 @@ def test_the_seconds_of_a_run_hold_those_of_its_preparation_and_of_relearning(
         (
             Greedy,
             "loss() of stage 1 (right)",
-            f"draws {2 * BATCH} samples of the target in a step: {BATCH}, its",
+            f"draws {2 * BATCH} samples of the target in a step: the budget of every method is {BATCH}, the",
         ),
         (Hoarding, "start_task() of stage 2 (down)", "draws from data after the hooks that received it"),
     ],

@@ -11,11 +11,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+import torch
 from helpers import back_end_or_skip, stage_policies
 from PIL import Image, ImageDraw
 
 from clbench.cli.film import film
 from clbench.evaluation.episodes import Episode, Trial
+from clbench.policy.policy import Policy
 from clbench.records.record import Record
 from clbench.runs.film import (
     FAILURE,
@@ -29,7 +31,8 @@ from clbench.runs.film import (
     shoot,
 )
 from clbench.runs.run import execute
-from clbench.runs.spec import RunSpec
+from clbench.runs.spec import ResolvedRun, RunSpec
+from clbench.runs.stages import find_stages, load_stages
 from clbench.spec.registry import load_scenario
 from clbench.testing import ToyWorld
 
@@ -243,6 +246,37 @@ def test_a_film_of_several_methods_shows_each_after_the_last_target(
     assert written[2:5] == ["before any target", "after sft", "after frozen"]
     with Image.open(path) as gif:
         assert gif.size[0] == 3 * (120 + 8) + 8
+
+
+def test_a_method_that_changes_the_policy_before_the_first_target_has_a_column_of_its_own(
+    recorded: tuple[Record, Path], tmp_path: Path, written: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = find_stages(SPEC.resolve(), recorded[1])
+
+    def load(run: ResolvedRun, folder: Path) -> list[Policy]:
+        policies = load_stages(SPEC.resolve(), folder)
+        if run.label == "fast_dvla":
+            torch.nn.init.zeros_(next(policies[0].parameters()))
+        return policies
+
+    monkeypatch.setattr("clbench.runs.stages.find_stages", lambda *_: kept)
+    monkeypatch.setattr("clbench.runs.stages.load_stages", load)
+    film(TOY, "sft", "l2_sp", "fast_dvla", tasks="left", size=240, output=tmp_path / "toy.gif")
+    shared, own = "before any target", "fast_dvla, before any target"
+    assert written[2:7] == [shared, "after sft", "after l2_sp", own, "after fast_dvla"]
+
+
+@pytest.mark.long
+def test_policies_of_another_kind_and_order_are_filmed_as_they_were_kept(
+    tmp_path: Path, written: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = RunSpec(TOY, "frozen", 0, order=1, policy="discrete_diffusion")
+    execute(spec, tmp_path / "records", checkpoints=tmp_path)
+    monkeypatch.setattr("clbench.jobs.scheduler.run_with_bars", lambda *_: pytest.fail("trained again"))
+    chosen: dict[str, Any] = {"order": 1, "policy": "discrete_diffusion"}
+    film(TOY, "frozen", tasks="left", size=260, output=tmp_path / "toy.gif", checkpoints=tmp_path, **chosen)
+    assert written[0].startswith("clbench/Toy-v0+discrete_diffusion, frozen, seed 0 order 1, val")
+    assert written[2:5] == ["stage 0, before any target", "stage 1, after down", "stage 2, after right"]
 
 
 @pytest.mark.parametrize(

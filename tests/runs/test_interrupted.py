@@ -11,8 +11,10 @@ import pytest
 from tiny import TINY
 from torch import Tensor
 
-from clbench.learning.method import Method, Stage
+from clbench.learning.method import Method, Progress, Stage
+from clbench.learning.prior import Uses
 from clbench.policy.policy import Policy
+from clbench.runs.length import run_length, training_length, watching_length
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.runs.stages import make_stages
@@ -81,6 +83,34 @@ def test_a_run_goes_on_only_where_the_processor_computes_like_the_first_one(
     record = execute(spec, tmp_path)
     assert record.status == "success"
     assert ("resumed_after" in record.timing) == resumed
+
+
+@dataclasses.dataclass
+class _Watches(_InterruptedOnce):
+    """Looks on during the pretraining, too."""
+
+    uses = Uses(demonstrations="prepare")
+
+    def watch_pretraining(self, policy: Policy, progress: Progress) -> None:
+        """Watch."""
+
+
+def test_the_bar_of_a_run_counts_the_watched_pretraining_once_wherever_it_goes_on(
+    tmp_path: Path, stranger: Callable[[type[Method]], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_InterruptedOnce, "lost", [])
+    spec = RunSpec(TINY.id, stranger(_Watches), seed=0)
+    run, amounts = spec.resolve(), list[float]()
+    with pytest.raises(KeyboardInterrupt):
+        execute(spec, tmp_path)
+    assert execute(spec, tmp_path, amounts.append).timing["resumed_after"] == 1
+    watched = watching_length(run.method, run.scenario)
+    assert watched == TINY.budget.pretraining_steps
+    assert sum(amounts) == pytest.approx(run_length(run.scenario, run.protocol) + watched, rel=0.05)
+    make_stages(run)
+    amounts.clear()
+    make_stages(run, amounts.append)  # all stages are in the cache
+    assert sum(amounts) == training_length(run.scenario) + watched
 
 
 SOURCE = """

@@ -1,6 +1,7 @@
 """Run specifications: names are looked up once, and later code receives the resolved run."""
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 from tiny import TINY
 
 from clbench.base.errors import ClbenchError, InputError, UnknownNameError
+from clbench.records.reader import check_home
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec, check_device
 
@@ -80,6 +82,16 @@ def test_a_run_by_name_has_the_path_of_its_record_however_a_value_was_typed(
     spec = RunSpec(TOY, "sft", 0, {"step_factor": text})
     place = tmp_path / "Toy-v0" / f"sft+step_factor={float(text)}" / "seed-0.json"
     assert spec.path(tmp_path) == spec.resolve().path(tmp_path) == place
+
+
+def test_a_run_with_a_tuple_lies_where_readers_expect_its_record(
+    write_module: Callable[[str, str], None], tmp_path: Path
+) -> None:
+    lines = ["from dataclasses import dataclass", "from clbench import Method", "@dataclass"]
+    lines += ["class Paired(Method):", '    """Has a pair."""', "    betas: tuple = (0.9, 0.999)"]
+    write_module("paired", "\n".join(lines))
+    run = RunSpec(TOY, "paired:Paired", 0, {"betas": (0.5, 0.6)}).resolve()
+    assert check_home(run.info, run.path(tmp_path), tmp_path).parts[1] == "paired.Paired+betas=[0.5, 0.6]"
 
 
 @pytest.mark.parametrize(

@@ -217,7 +217,7 @@ def test_a_torn_policy_is_not_used_and_the_log_says_so(
     [
         ('{"scale": 1, "scale": 2}', "the name 'scale' is there twice"),
         (f'{{"scale": {"[" * 99}{"]" * 99}}}', "scale: nested more than 16 deep"),
-        ('{"scale": NaN}', "NaN is no number"),
+        ('{"scale": NaN}', "NaN is not a JSON number"),
         ("[1]", "cannot be read as the state of a method"),
     ],
 )

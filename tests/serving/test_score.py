@@ -309,12 +309,12 @@ def test_chunks_of_another_length_are_refused_unless_the_number_executed_is_give
 ) -> None:
     lengths = iter([4, 6])
     with pytest.raises(
-        InputError, match=r"\(40, 6, 2\), not \(40, H, A\): .* 4 actions as before; --executed 4"
+        InputError, match=r"\(40, 6, 2\), not \(40, H, A\): .* 4 actions as before; executed=4 "
     ):
         run(lambda shown: knowing(0, next(lengths))(shown), 0)
     run(knowing(0, 4), 0)
     with pytest.raises(
-        InputError, match=r"\(40, 6, 2\), not \(40, H, A\): .* 4 actions as before; --executed 4"
+        InputError, match=r"\(40, 6, 2\), not \(40, H, A\): .* 4 actions as before; executed=4 "
     ):
         run(knowing(1, 6), 1)
     with pytest.raises(InputError, match=r"settings of .* are \{'executed': 6\}, but were \{'executed': 4\}"):
@@ -338,6 +338,7 @@ def test_metadata_of_the_server_are_kept_if_they_are_texts_and_numbers(run: Call
         "steps": np.int64(100),
         "rate": 1e-4,
         "nan": float("nan"),
+        "too large": 10**400,
         "weights": np.zeros(1000),
         "nested": {"a": 1},
         "long": "x" * 1000,
@@ -403,6 +404,7 @@ def test_a_checkpoint_that_was_scored_with_another_seed_is_no_second_training(
             4,
             r"shape \(40, 3, 2\), not \(40, H, A\): for each episode at least 4 actions",
         ),
+        ([[[0.0, 0.0]]] * 39 + [[[0.0]]], None, r"one shape \(40, H, A\), but its lists differ in length"),
         (np.zeros((40, 3, 7)), None, r"shape \(40, 3, 7\), not \(40, 3, 2\)"),
         (np.zeros((1, 3, 2)), None, r"shape \(1, 3, 2\), not \(40, 3, 2\)"),
     ],

@@ -32,6 +32,18 @@ def test_what_a_record_cannot_mean_is_refused(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("chunks", "message"),
+    [
+        (np.zeros((40, 2, 3)), r"policy's action has the shape \(40, 2, 3\), not \(40, 2, 2\)"),
+        (np.full((40, 2, 2), "0"), r"policy's action must be 2 numbers, not a ndarray \(of type <U1\)"),
+    ],
+)
+def test_a_fault_of_the_actions_is_the_policys(chunks: Any, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        score(ID, lambda _: chunks, stage=0, method="me/still", records=tmp_path)
+
+
 @pytest.mark.parametrize(("seed", "split"), [(99, "test"), (100, "validation")])
 def test_settings_are_chosen_on_validation_episodes_with_a_tuning_seed(
     seed: int, split: str, tmp_path: Path

@@ -9,7 +9,7 @@ import pytest
 from agents import ID
 
 from clbench.base.errors import InputError
-from clbench.evaluation.views import Views
+from clbench.evaluation.views import SimulatorCameras
 from clbench.records.record import Record
 from clbench.serving.score import is_scored
 
@@ -19,17 +19,17 @@ def idle(observations: dict[str, Any]) -> Any:
     return np.zeros((len(observations["state"]), 1, 2))
 
 
-def _drawn(self: Views, lanes: Any, lane: int, task: Any) -> dict[str, Any]:
+def _drawn(self: SimulatorCameras, lanes: Any, lane: int, task: Any) -> dict[str, Any]:
     """Return pictures that show which camera drew which lane."""
     shape = (self.size, self.size, 3)
-    return {name: np.full(shape, 100 * number + lane, np.uint8) for number, name in enumerate(self.cameras)}
+    return {name: np.full(shape, 100 * number + lane, np.uint8) for number, name in enumerate(self.names)}
 
 
 def test_a_policy_gets_the_pictures_of_each_episode_and_the_record_keeps_which(
     run: Callable[..., Record], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Views, "check", lambda *_: None)
-    monkeypatch.setattr(Views, "draw", _drawn)
+    monkeypatch.setattr(SimulatorCameras, "check", lambda *_: None)
+    monkeypatch.setattr(SimulatorCameras, "draw", _drawn)
     seen: list[dict[str, Any]] = []
 
     def act(observations: dict[str, Any]) -> Any:
@@ -52,8 +52,8 @@ def test_a_policy_gets_the_pictures_of_each_episode_and_the_record_keeps_which(
 def test_all_stages_have_the_same_pictures(
     run: Callable[..., Record], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Views, "check", lambda *_: None)
-    monkeypatch.setattr(Views, "draw", _drawn)
+    monkeypatch.setattr(SimulatorCameras, "check", lambda *_: None)
+    monkeypatch.setattr(SimulatorCameras, "draw", _drawn)
     run(idle, 0, pictures=["front"], picture_size=8)
     for other in ({}, {"pictures": ["wrist"], "picture_size": 8}, {"pictures": ["front"]}):
         with pytest.raises(InputError, match=r"The settings of .* but were .*'pictures': \['front'\]"):
@@ -69,8 +69,8 @@ def test_all_stages_have_the_same_pictures(
 def test_a_run_may_start_over_with_other_pictures_and_older_stages_have_none(
     run: Callable[..., Record], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Views, "check", lambda *_: None)
-    monkeypatch.setattr(Views, "draw", _drawn)
+    monkeypatch.setattr(SimulatorCameras, "check", lambda *_: None)
+    monkeypatch.setattr(SimulatorCameras, "draw", _drawn)
     run(idle, 0)
     with pytest.raises(
         InputError, match=r"are .*'pictures': \['front'\].*, but were {'executed': 1} in stage 0"

@@ -296,7 +296,7 @@ def test_a_scenario_without_a_target_is_named() -> None:
         check_scenario(dataclasses.replace(TOY, target=()))
 
 
-@pytest.mark.parametrize("episodes", [0, 2.5])
+@pytest.mark.parametrize("episodes", [0, 2.5, None])
 def test_a_check_needs_a_whole_number_of_episodes(episodes: Any) -> None:
     with pytest.raises(InputError, match=f"episodes must be a whole number from 1, not {episodes}"):
         check_scenario(TOY, episodes=episodes)
