@@ -57,6 +57,14 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser().absolute() / "clbench"
 
 
+def minari_folder() -> Path:
+    """Return the folder of all Minari datasets: `MINARI_DATASETS_PATH` if it is set, else Minari's own.
+
+    Minari itself takes an empty value for a folder, and does not expand a tilde.
+    """
+    return Path(os.environ.get("MINARI_DATASETS_PATH") or "~/.minari/datasets").expanduser().absolute()
+
+
 def hash_of(values: Any) -> str:
     """Return a short hash of anything that JSON can hold."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
@@ -191,7 +199,7 @@ def _fault(folder: Path, key: str) -> str | None:
         refused = refusal(error)
         if refused is not None:
             raise CacheError(f"{folder} cannot be read now: {refused.strerror}.") from error
-        return "is torn or foreign: it has no readable manifest"
+        return "is torn, or was not made by clbench: it has no readable manifest"
     return None
 
 

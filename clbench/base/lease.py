@@ -140,11 +140,12 @@ class Lease:
         """Refuse to go on without the lease.
 
         Raises:
-            LeaseLostError: Another process has it.
+            LeaseLostError: Another process has it, or its file was removed.
         """
         if self._is_lost():
             raise LeaseLostError(
-                f"{self._file} was lost to another process: this one did not answer for {SECONDS:.0f} s."
+                f"This process lost {self._file}: it did not answer for {SECONDS:.0f} s and another process "
+                "took over, or the file was removed."
             )
 
     def _is_lost(self) -> bool:

@@ -15,6 +15,7 @@ import errno
 import functools
 import hashlib
 import importlib.util
+import inspect
 import os
 import re
 import stat
@@ -225,13 +226,20 @@ def class_hash(cls: type) -> str:
     """
     digest = hashlib.sha256()
     for name, value in sorted(vars(cls).items()):
-        function = getattr(value, "__func__", getattr(value, "fget", value))  # of a class method, a property
-        code = getattr(function, "__code__", None)
+        code = getattr(_undecorated(value), "__code__", None)
         if code is not None:
             digest.update(f"{name} {_code_text(code)}".encode())
         elif not name.startswith("__") and isinstance(value, str | int | float | tuple | None):
             digest.update(f"{name} {value!r}".encode())
     return digest.hexdigest()[:16]
+
+
+def _undecorated(value: object) -> object:
+    """Return the function of a class method, a property or a cached one, without its decorators."""
+    function = next(
+        (getattr(value, name) for name in ("__func__", "fget", "func") if hasattr(value, name)), value
+    )
+    return inspect.unwrap(function) if callable(function) else function
 
 
 def _code_text(code: CodeType) -> str:

@@ -68,8 +68,8 @@ def read_json(path: Path) -> Any:
     return value
 
 
-def read_regular(path: Path) -> bytes:
-    """Return the content of the regular file at `path`.
+def read_regular(path: Path, most: int = MOST_BYTES) -> bytes:
+    """Return the content of the regular file at `path`, which may have `most` bytes.
 
     Raises:
         StrictJSONError: The file is a link, not regular, or too large.
@@ -80,10 +80,10 @@ def read_regular(path: Path) -> bytes:
     with open(path, "rb", opener=lambda name, flags: os.open(name, flags | OPEN_PLAINLY)) as file:
         status = os.fstat(file.fileno())
         if not stat.S_ISREG(status.st_mode):
-            raise StrictJSONError("is no regular file.")
-        if status.st_size > MOST_BYTES:
-            raise StrictJSONError(f"has {status.st_size:,} bytes, more than {MOST_BYTES:,}.")
-        content = file.read(MOST_BYTES + 1)
+            raise StrictJSONError("is not a regular file.")
+        if status.st_size > most:
+            raise StrictJSONError(f"has {status.st_size:,} bytes, more than {most:,}.")
+        content = file.read(most + 1)
     if len(content) != status.st_size:
         raise StrictJSONError("changed its size while it was read.")
     return content
@@ -91,7 +91,7 @@ def read_regular(path: Path) -> bytes:
 
 def _no_number(name: str) -> Any:
     """Refuse NaN and infinities, which Python reads although JSON does not have them."""
-    raise InputError(f"{name} is no number")
+    raise InputError(f"{name} is not a JSON number")
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -127,7 +127,7 @@ def _check(where: str, value: Any, depth: int) -> None:
         _check_scalar(where, value)
         return
     if kind not in (list, dict):
-        raise StrictJSONError(f"{where}: {kind.__name__} is no type of JSON.")
+        raise StrictJSONError(f"{where}: JSON has no type {kind.__name__}.")
     if depth == DEEPEST:
         raise StrictJSONError(f"{where}: nested more than {DEEPEST} deep.")
     if kind is dict:
@@ -159,7 +159,8 @@ def _check_name(where: str, name: Any) -> None:
         raise StrictJSONError(f"{where}: the name of an entry must be a string, not {name!r}.")
     if len(name) > LONGEST_NAME:
         raise StrictJSONError(
-            f"{where}: a name of {len(name):,} characters: {quoted(name)}; {LONGEST_NAME} are the most."
+            f"{where}: a name of {len(name):,} characters: {quoted(name)}; at most {LONGEST_NAME} are "
+            "allowed."
         )
 
 
@@ -168,8 +169,10 @@ def _check_scalar(where: str, value: Any) -> None:
     if kind is float and not math.isfinite(value):
         raise StrictJSONError(f"{where}: a number that is not finite.")
     if kind is int and abs(value) >= LARGEST:
-        raise StrictJSONError(f"{where}: a whole number of {value.bit_length()} bits; 64 are the most.")
+        raise StrictJSONError(
+            f"{where}: a whole number of {value.bit_length()} bits; at most 64 are allowed."
+        )
     if kind is str and len(value) > LONGEST_TEXT:
         raise StrictJSONError(
-            f"{where}: a string of {len(value):,} characters; {LONGEST_TEXT:,} are the most."
+            f"{where}: a string of {len(value):,} characters; at most {LONGEST_TEXT:,} are allowed."
         )

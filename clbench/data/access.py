@@ -121,7 +121,7 @@ def check_episodes(episodes: Iterable[tuple[str, Split]]) -> None:
         return
     for task, split in episodes:
         if split != "validation":
-            raise LeakError(f"The method runs {split} episodes of {task}: nothing may be chosen on them.")
+            raise LeakError(f"The method runs {split} episodes of {task}: no choice may depend on them.")
         _check_task(task, "runs episodes")
 
 
@@ -140,7 +140,9 @@ def check_questions() -> None:
         LeakError: Hooks are running.
     """
     if _rights.get() is not None:
-        raise LeakError("The method loads questions by itself, the test questions too: `prior` has its own.")
+        raise LeakError(
+            "The method loads the questions itself, the test questions too: use `prior.questions`."
+        )
 
 
 def check_policy(policy: Policy, pretrained: Policy) -> None:

@@ -18,7 +18,7 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 from torch import Tensor
 
-from clbench.base.cache import cached, hash_of, is_cached
+from clbench.base.cache import cached, hash_of, is_cached, minari_folder
 from clbench.base.dependencies import versions
 from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError
@@ -200,10 +200,8 @@ def keep_dataset(task: Task, budget: Budget, episodes: Callable[[World], Sequenc
         episodes: Returns the episodes, given an environment of the task's world. It is called only if there
             is no such dataset yet.
     """
-    from minari.storage.datasets_root_dir import get_dataset_path
-
     name = dataset_id(task, budget)
-    folder = get_dataset_path(name)
+    folder = minari_folder() / name
     _declare_namespaces(folder, name)
 
     def make(partial: Path) -> None:
@@ -215,9 +213,7 @@ def keep_dataset(task: Task, budget: Budget, episodes: Callable[[World], Sequenc
 
 def has_dataset(task: Task, budget: Budget) -> bool:
     """Return whether Minari's folder holds the task's whole dataset, of this version of task and clbench."""
-    from minari.storage.datasets_root_dir import get_dataset_path
-
-    return is_cached(get_dataset_path(dataset_id(task, budget)), dataset_inputs(task, budget))
+    return is_cached(minari_folder() / dataset_id(task, budget), dataset_inputs(task, budget))
 
 
 def _declare_namespaces(folder: Path, dataset_id: str) -> None:

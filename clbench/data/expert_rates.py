@@ -67,6 +67,7 @@ def complaint(task: Task, row: Measurement) -> str | None:
     if row.success >= 0.5:
         return None
     return (
-        f"The expert of {task.name!r} succeeds in {row.success:.0%} of its episodes: no demonstrations can "
-        f"be collected of it. Fix {task.expert} or the success rule; train it longer where it was trained."
+        f"The expert of {task.name!r} succeeds in {row.success:.0%} of its episodes: clbench cannot "
+        f"collect demonstrations from it. Fix {task.expert} or the success rule; if the expert was trained, "
+        "train it longer."
     )

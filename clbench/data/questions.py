@@ -154,7 +154,10 @@ class Questions:
         cells = [torch.nonzero(answers == index)[:, 0] for index in range(len(kind.answers))]
         for answer, rows in zip(kind.answers, cells, strict=True):
             if not len(rows):
-                raise InputError(f"No state answers {answer!r} to {kind.name!r}: {kind.wordings[0]!r}.")
+                raise InputError(
+                    f"No state gives the answer {answer!r} to the question {kind.name!r}: "
+                    f"{kind.wordings[0]!r}."
+                )
         return cells
 
     def __len__(self) -> int:

@@ -59,12 +59,13 @@ def adapt(
         chosen = method.start_task(policy, stage)
     if budget.criterion is not None and taken():
         raise MethodError(
-            f"start_task() took {counted(taken(), 'optimiser step')}. A target is learned in the steps that "
-            "follow, whose checks end the stage: what is learned before them would not count."
+            f"start_task() took {counted(taken(), 'optimiser step')}. With a criterion it must take none: "
+            "only the steps that follow it count, and their checks end the stage."
         )
     if chosen is None:
         raise MethodError(
-            "start_task() must return the parameters to train, not None: `return policy.parameters()` is all."
+            "start_task() must return the parameters to train, not None: `return policy.parameters()` "
+            "trains all of them."
         )
     parameters: list[Any] = list(chosen)
     to_criterion = budget.criterion is not None

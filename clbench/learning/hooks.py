@@ -75,7 +75,7 @@ def misfits(cls: type[Method]) -> dict[str, tuple[str, str]]:
 DECLARATIONS: dict[str, tuple[Any, str]] = {
     "uses": (Uses, "a Uses"),
     "metadata": (Metadata, "a Metadata"),
-    "tunes": (tuple | None, "a tuple, the name of a hyper-parameter and two values of it, or None"),
+    "tunes": (tuple | None, "a tuple of a hyper-parameter's name and two values of it, or None"),
     "needs": (tuple, "a tuple of abilities of a policy"),
     "whole_stages": (bool, "a bool"),
 }

@@ -73,7 +73,8 @@ class Nothing:
         """
         raise MissingDataError(
             "The method draws from prior demonstrations, but there are none: the scenario retains no tasks, "
-            "and this is before its second target. Where len(prior.demonstrations) is 0, it must do without."
+            "and this is before its second target. Where len(prior.demonstrations) is 0, the method must not "
+            "draw."
         )
 
 
@@ -135,7 +136,7 @@ class Source(Generic[Rows]):
             if self._left < 0:
                 raise UndeclaredAccessError(
                     f"The method draws {self.batch_size - self._left} samples of the target in a step: "
-                    f"{self.batch_size}, its `batch_size`, are the budget of all methods."
+                    f"the budget of every method is {self.batch_size}, the target's `batch_size`."
                 )
         rows: Rows = self._open.sample(count, self._generator).to(self._device)
         return rows

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from clbench.base.cache import cache_folder, cached, hash_of, hash_of_tensors
+from clbench.base.cache import cache_folder, cached, hash_of, hash_of_tensors, is_cached
 from clbench.base.progress import ProgressCallback
 from clbench.learning.method import Method, MethodState, Progress
 from clbench.learning.method_state import read_state, write_state
@@ -83,5 +83,7 @@ def watch(
             state = method.state()
         write_state(partial, state)
 
-    folder = cached(cache_folder() / "watched" / hash_of(inputs), inputs, make)
-    return read_state(folder, pretrained.device)
+    folder = cache_folder() / "watched" / hash_of(inputs)
+    if is_cached(folder, inputs):
+        progress(scenario.budget.pretraining_steps)  # the bar of a run counts them
+    return read_state(cached(folder, inputs, make), pretrained.device)

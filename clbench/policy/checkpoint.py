@@ -110,11 +110,11 @@ def _fault(config: PolicyConfig, tensors: Mapping[str, Tensor], kind: str | None
     if config.image_size % PATCH:
         return f"pictures of {config.image_size} pixels cannot be cut into patches of {PATCH}"
     if config.executed > config.chunk:
-        return f"a chunk of {config.chunk} steps has no {config.executed} to execute"
+        return f"executed must be at most {config.chunk}, the steps of a chunk, not {config.executed}"
     if config.kind not in POLICIES:  # its sizes mean what its class makes of them
         return None
     if config.layers > len(tensors):
-        return f"{config.layers:,} layers cannot have {len(tensors):,} tensors"
+        return f"{config.layers:,} layers need at least as many tensors, but the file has {len(tensors):,}"
     held = sum(value.numel() for value in tensors.values())
     # one square matrix per layer and one vector per number, word and action: a tenth of a policy
     rows = config.layers * config.width + config.state_size + config.vocabulary_size

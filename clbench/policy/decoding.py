@@ -136,7 +136,10 @@ def pipelined(
     if steps < 1 or head.chunk % steps:
         raise InputError(f"A chunk of {head.chunk} steps cannot be cut into blocks of {steps}.")
     if not cached and steps not in (head.block, head.chunk):
-        raise InputError(f"Blocks of {steps} steps need kept keys: those of the head have {head.block}.")
+        raise InputError(
+            f"Blocks of {steps} steps need kept keys (cached=True): the head's blocks have "
+            f"{head.block} steps."
+        )
     if cached and len(mask) > 1:
         rows = range(len(mask))
         parts = [[layer[row : row + 1] for layer in hidden] for row in rows]

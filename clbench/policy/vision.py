@@ -59,7 +59,7 @@ class Vision(nn.Module):
         size = (self.image_size, self.image_size, 3)
         if image is None or tuple(image.shape[1:]) != size:
             found = "none" if image is None else tuple(image.shape[1:])
-            raise InputError(f"The policy sees an image of {size}, not {found}: hand over `batch.image`.")
+            raise InputError(f"The policy needs images of shape {size}, not {found}: pass `batch.image`.")
         pixels = image.permute(0, 3, 1, 2).float() / 127.5 - 1.0
         tokens = cast(Tensor, self.out(self.convolutions(pixels).flatten(1)))
         return tokens.view(len(image), self.tokens, self.width)

@@ -20,14 +20,12 @@ def is_whole(value: Any) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
-def whole_number(name: str, value: int | None, least: int) -> int | None:
-    """Return a whole number of Python or NumPy as a Python int, which JSON can hold; None stays None.
+def whole_number(name: str, value: int, least: int) -> int:
+    """Return a whole number of Python or NumPy as a Python int, which JSON can hold.
 
     Raises:
         InputError: The value is not a whole number, or is below `least`.
     """
-    if value is None:
-        return None
     if not is_whole(value) or value < least:
         raise InputError(f"{name} must be a whole number from {least}, not {value!r}.")
     return int(value)
@@ -82,14 +80,15 @@ def check_tuple(part: object, kind: type, *fields: str) -> None:
     Raises:
         WrongTypeError: A field is not a tuple, or has an entry of another type.
     """
-    entry = "text" if kind is str else kind.__name__
+    entry = "string" if kind is str else kind.__name__
     for name in fields:
         value = getattr(part, name)
         if isinstance(value, tuple) and all(isinstance(one, kind) for one in value):
             continue
         found = f"one {entry}" if isinstance(value, kind) else quoted(repr(value))
         raise WrongTypeError(
-            f"{_place(part, name)} must be a tuple of {entry}s, not {found}; a tuple of one is (one,)."
+            f"{_place(part, name)} must be a tuple of {entry}s, not {found}; write a tuple with one entry as "
+            "(entry,)."
         )
 
 

@@ -117,7 +117,7 @@ def check_method_name(method: str) -> None:
     if len(method) > LONGEST or not _METHOD.fullmatch(method):
         raise InputError(
             f"{quoted(method)} cannot be the name of a method: it must be package/name or module:Class. "
-            "A name has letters, digits, _, and single - and . between them, and begins with a letter."
+            "A name begins with a letter, and has letters, digits and _ with single - or . between them."
         )
     _check_reserved(method)
     _check_alike("method", method, built_in_methods())
@@ -141,7 +141,7 @@ def check_label(label: str) -> None:
     if len(label) > LONGEST_LABEL or not _CHANGES.fullmatch(plus + changes):
         raise InputError(
             f"{quoted(label)} cannot be the name of a folder: settings may have letters, digits, spaces and "
-            f".,()[]'+-, and all of it {LONGEST_LABEL} characters."
+            f".,()[]'+- only. The whole name may have at most {LONGEST_LABEL} characters."
         )
 
 

@@ -42,7 +42,7 @@ def policy_name(kind: str, size: str = SMALL) -> str:
     if size not in SIZES:
         raise unknown("size of a policy", size, SIZES)
     if size != SMALL and kind not in POLICIES:
-        raise InputError(f"Only {' and '.join(POLICIES)} have sizes; {kind} cannot be {size}.")
+        raise InputError(f"Only {' and '.join(POLICIES)} have sizes; {kind} cannot have the size {size}.")
     return kind if size == SMALL else f"{kind}-{size}"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 
 import gymnasium
@@ -31,13 +32,18 @@ def register(scenario_id: str, entry_point: str) -> None:
     """
     check_scenario_id(scenario_id)
     if not isinstance(entry_point, str) or not is_entry_point(entry_point):
-        raise InputError(f"{entry_point!r} must be the place of a scenario, as 'package.module:SCENARIO'.")
+        raise InputError(
+            "The entry point of a scenario must have the form 'package.module:SCENARIO', not "
+            f"{entry_point!r}."
+        )
     if scenario_id.startswith("clbench/") and not entry_point.startswith(("clbench.", "clbench:")):
         raise InputError(f"{scenario_id!r} is in the namespace of clbench: choose your own.")
     kwargs = {"scenario": entry_point}
     known = gymnasium.registry.get(scenario_id)
     if known is not None and known.kwargs != kwargs:
-        raise InputError(f"{scenario_id!r} is registered already, and not for {entry_point!r}.")
+        raise InputError(
+            f"{scenario_id!r} is already registered, with another entry point than {entry_point!r}."
+        )
     if known is None:
         registration.register(
             id=scenario_id,
@@ -71,7 +77,10 @@ def importable(scenario_id: str) -> str:
         return scenario_id
     module = gymnasium.registry[scenario_id].kwargs["scenario"].partition(":")[0]
     if module == "__main__":
-        raise InputError(f"{scenario_id} is defined in a notebook or script: put it into a module.")
+        raise InputError(
+            f"{scenario_id} is defined in a notebook or script, which other processes cannot import: put it "
+            "into a module."
+        )
     return scenario_id if module.startswith("clbench.envs.") else f"{module}:{scenario_id}"
 
 
@@ -115,19 +124,31 @@ def opened_scenario(scenario: Scenario | str, order: int = 0) -> Scenario:
 
 
 def _scenario_at(entry_point: str) -> Scenario:
-    # they import the tokenizer, which registration does without
-    from clbench.spec.language import fitting_length, spelled_words, vocabulary
+    from clbench.spec.language import fitting_length  # the tokenizer, which registration does without
 
     scenario = resolve(entry_point)
     if not isinstance(scenario, Scenario):
-        raise UnknownNameError(f"{entry_point!r} is no Scenario but a {type(scenario).__name__}.")
+        raise UnknownNameError(
+            f"{entry_point!r} must be a Scenario, not an object of type {type(scenario).__name__}."
+        )
     instructions = tuple(
         text for task in scenario.tasks for text in task.instructions + task.test_instructions
     )
     fitting_length(instructions)
+    _warn_of_spelled_words(scenario.id, instructions)
+    return scenario
+
+
+@functools.cache
+def _warn_of_spelled_words(name: str, instructions: tuple[str, ...]) -> None:
+    """Warn of words in the instructions of a scenario that look misspelled, once."""
+    from clbench.spec.language import spelled_words, vocabulary
+
     for word in spelled_words(instructions):
         if hint := did_you_mean(word, vocabulary()):
             LOG.warning(
-                "%s: the word %r is not in the vocabulary, and is spelled.%s", scenario.id, word, hint
+                "%s: the word %r is not in the vocabulary, so the policy reads it in pieces.%s",
+                name,
+                word,
+                hint,
             )
-    return scenario

@@ -74,8 +74,8 @@ class Scenario:
         check_policy_name(self.policy)
         if not self.scene_tasks:
             raise InputError(
-                f"{self.id}: without retained tasks it needs scenes, tasks whose states are asked about, "
-                "for example scenes=target."
+                f"{self.id}: a scenario without retained tasks needs scenes (tasks that give the states for "
+                "its questions), for example scenes=target."
             )
         cameras = {task.camera or "none" for task in self.tasks + self.background + self.scenes}
         if len(cameras) > 1:

@@ -61,7 +61,9 @@ class Task:
         if not self.instructions or not all(
             words.strip() for words in self.instructions + self.test_instructions
         ):
-            raise InputError(f"The task {self.name} needs an instruction, and none of them may be empty.")
+            raise InputError(
+                f"The task {self.name} needs at least one instruction, and no instruction may be empty."
+            )
         check_whole(self, 1, "horizon")
         check_whole(self, 0, "version")
         check_share(self, "action_noise")

@@ -118,6 +118,8 @@ def working_back_end(worlds: Iterable[str], chosen: str | None) -> str:
         faults.append(f"{back_end} ({found[0]})")
     message = f"The worlds cannot be drawn with {' or '.join(faults)}."
     if chosen:
-        raise RenderingError(f"{message} MUJOCO_GL is set to {chosen}: unset it, and what works is chosen.")
+        raise RenderingError(
+            f"{message} MUJOCO_GL is set to {chosen}: unset it, and clbench chooses what works."
+        )
     commands = " or ".join(f"apt-get install {packages}" for packages in DEBIAN_PACKAGES.values())
     raise RenderingError(f"{message} On Debian and Ubuntu: {commands}")

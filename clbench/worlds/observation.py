@@ -160,7 +160,7 @@ class _DrawingProcess:
         self._complaints.seek(0)
         lines = self._complaints.read().decode(errors="replace").strip().splitlines()
         reason = lines[-1] if lines else f"exit code {code}"
-        return RenderingError(f"The process of {self._camera} that draws has ended: {reason}")
+        return RenderingError(f"The drawing process of {self._camera} has ended: {reason}")
 
     def close(self) -> None:
         """End the process."""

@@ -79,8 +79,8 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         )
         if render_mode is not None:
             raise InputError(
-                "Many environments side by side cannot be drawn. Draw one with gymnasium.make(...), or give "
-                'gymnasium.make_vec(..., vectorization_mode="sync").'
+                "This vector environment cannot be drawn. Draw a single environment with "
+                'gymnasium.make(...), or use gymnasium.make_vec(..., vectorization_mode="sync").'
             )
         self.scenario = opened_scenario(scenario, order)
         if num_envs < 1:
@@ -204,7 +204,9 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
             raise gymnasium.error.ResetNeeded(f"{self.scenario.id} has no episodes yet: call reset().")
         actions, shape = np.asarray(actions), self.action_space.shape
         if actions.shape != shape:  # NumPy would repeat a single action
-            raise InputError(f"The actions must have shape {shape}, not {actions.shape}: a row each.")
+            raise InputError(
+                f"The actions must have shape {shape}, not {actions.shape}: one row per environment."
+            )
         if self._ended.any():
             if self.autoreset_mode is AutoresetMode.DISABLED:
                 raise gymnasium.error.ResetNeeded(

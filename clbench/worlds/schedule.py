@@ -91,7 +91,7 @@ class Schedule:
         self._stage, self._task, self._episode = stage, task, -1
         self._first = 0 if scenario.retained else 1
         if stage is not None and task is not None:
-            raise InputError("Give stage or task, not both: a task has its stage.")
+            raise InputError("Give stage or task, not both: a task determines its stage.")
         if stage is not None:
             self._check_stage(stage)
         if task is not None:
@@ -121,7 +121,7 @@ class Schedule:
         if set(options) - {"task", "stage"}:
             raise InputError(f'Options of reset are "task" and "stage", not {sorted(options)}.')
         if "task" in options and "stage" in options:
-            raise InputError('Options of reset are "task" or "stage", not both: a task has its stage.')
+            raise InputError('Options of reset are "task" or "stage", not both: a task determines its stage.')
         task, stage = self._choose(options)
         words = task.instructions[int(generator.integers(len(task.instructions)))]
         shown = shown_instruction(words, self._format, self._scenario)

@@ -199,13 +199,17 @@ def checked_actions(
     """
     actions = np.asarray(actions)
     if actions.shape[1:] != space.shape:
-        raise InputError(f"An action of the {world} world has shape {space.shape}, not {actions.shape[1:]}.")
+        raise InputError(
+            f"An action of the {world} world must have shape {space.shape}, not {actions.shape[1:]}."
+        )
     if len(actions) != lanes:
-        raise InputError(f"{lanes} lanes of the {world} world take as many actions, not {len(actions)}.")
+        raise InputError(
+            f"{lanes} lanes of the {world} world need one action each, not {len(actions)} in total."
+        )
     finite = np.isfinite(actions)
     if not finite.all():
         wrong = actions[~finite.all(axis=1)][0]
-        raise InputError(f"An action of the {world} world is finite, not {wrong.tolist()}.")
+        raise InputError(f"An action of the {world} world must be finite, not {wrong.tolist()}.")
     within: NDArray[np.float32] = np.minimum(np.maximum(actions, space.low), space.high)
     return within.astype(np.float32, copy=False)
 

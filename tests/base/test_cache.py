@@ -40,9 +40,9 @@ def test_a_cached_result_is_used_again(tmp_path: Path) -> None:
         (lambda folder: (folder / "value.txt").write_text("firs"), "torn"),
         (lambda folder: (folder / "value.txt").unlink(), "torn"),
         (lambda folder: (folder / "stranger.txt").write_text("?"), "torn"),
-        (lambda folder: (folder / "clbench.json").unlink(), "torn or foreign"),
-        (lambda folder: (folder / "clbench.json").write_text("{"), "torn or foreign"),
-        (lambda folder: (folder / "clbench.json").write_text("[]"), "torn or foreign"),
+        (lambda folder: (folder / "clbench.json").unlink(), "is torn, or was not made by clbench"),
+        (lambda folder: (folder / "clbench.json").write_text("{"), "is torn, or was not made by clbench"),
+        (lambda folder: (folder / "clbench.json").write_text("[]"), "is torn, or was not made by clbench"),
     ],
 )
 def test_a_torn_or_foreign_folder_is_logged_and_made_again(

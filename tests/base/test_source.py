@@ -1,14 +1,17 @@
 """Hashes of source code: a cache key covers all code of its stage, and every module it names exists."""
 
 import errno
+import functools
 import importlib
 import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 
 from clbench.base.source import (
     DATA_SOURCES,
@@ -331,26 +334,35 @@ class Some:
     @property
     def size(self):
         return {size}
+
+    @torch.no_grad()
+    def end(self):
+        return {end}
+
+    @functools.cached_property
+    def limit(self):
+        return {limit}
 """
 
 
 def test_the_hash_of_a_typed_class_follows_its_code_and_values_and_not_its_place() -> None:
     def hashed(text: str) -> str:
-        space: dict[str, type] = {}
+        space: dict[str, Any] = {"torch": torch, "functools": functools}
         exec(text, space)
         return class_hash(space["Some"])
 
-    usual = {"number": 1, "name": "three", "size": 4}
+    usual = {"number": 1, "name": "three", "size": 4, "end": 6, "limit": 8}
     before = hashed(CLASS.format(**usual))
     assert hashed("# a remark\n\n" + CLASS.format(**usual)) == before
-    for change in ({"number": 2}, {"name": "four"}, {"size": 5}):
+    for change in ({"number": 2}, {"name": "four"}, {"size": 5}, {"end": 7}, {"limit": 9}):
         assert hashed(CLASS.format(**usual | change)) != before
 
 
 @pytest.mark.long
 def test_the_hash_of_a_typed_class_is_the_same_in_every_process() -> None:
-    text = CLASS.format(number=1, name="three", size=4)
-    code = f"from clbench.base.source import class_hash\n{text}\nprint(class_hash(Some))"
+    text = CLASS.format(number=1, name="three", size=4, end=6, limit=8)
+    imports = "import functools, torch\nfrom clbench.base.source import class_hash\n"
+    code = f"{imports}{text}\nprint(class_hash(Some))"
     command = [sys.executable, "-c", code]
     environments = [{**os.environ, "PYTHONHASHSEED": seed} for seed in ("1", "2")]
     first, second = (

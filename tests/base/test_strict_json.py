@@ -42,7 +42,7 @@ def test_json_within_the_limits_is_read(value: Any, tmp_path: Path) -> None:
     [
         ('{"a": 1, "a": 1}', "the name 'a' is there twice in one object"),
         ('[{"b": {"a": 1, "c": 2, "a": 1}}]', "the name 'a' is there twice in one object"),
-        ("[NaN]", "NaN is no number"),
+        ("[NaN]", "NaN is not a JSON number"),
         ('{"a": [1e999]}', "a: a number that is not finite"),
         (f'{{"a": {2**64}}}', "a: a whole number of 65 bits"),
         (f'{{"a": [{-(2**64)}, []]}}', "a: a whole number of 65 bits"),
@@ -75,8 +75,8 @@ def test_only_regular_files_are_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.json")
     for path, words in (
         (tmp_path / "link.json", "is a symbolic link"),
-        (tmp_path / "pipe.json", "is no regular file"),
-        (Path(os.devnull), "is no regular file"),
+        (tmp_path / "pipe.json", "is not a regular file"),
+        (Path(os.devnull), "is not a regular file"),
         (tmp_path, "cannot be read"),
         (tmp_path / "absent.json", "cannot be read"),
     ):

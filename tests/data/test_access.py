@@ -192,13 +192,13 @@ def _methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("Ahead", "reads demonstrations of down, which its stage must not know yet"),
         ("Direct", "reads demonstrations of down, which its stage must not know yet"),
         ("Undeclared", "reads demonstrations of left, which its `uses` does not declare"),
-        ("Chooser", "runs test episodes of right: nothing may be chosen on them"),
-        ("RobustChooser", "runs perturbed episodes of right: nothing may be chosen on them"),
+        ("Chooser", "runs test episodes of right: no choice may depend on them"),
+        ("RobustChooser", "runs perturbed episodes of right: no choice may depend on them"),
         ("EarlyChooser", "runs episodes of down, which its stage must not know yet"),
         ("Rehearser", "runs episodes of left, which its `uses` does not declare"),
         ("Pupil", "reads demonstrations of left, which its `uses` does not declare"),
-        ("Player", "runs test episodes of right: nothing may be chosen on them"),
-        ("Asker", "loads questions by itself, the test questions too"),
+        ("Player", "runs test episodes of right: no choice may depend on them"),
+        ("Asker", "loads the questions itself, the test questions too"),
         ("Normaliser", "changes state_mean: the normalisation is fixed in pretraining"),
         ("Talker", "changes the vocabulary or a size of the policy"),
     ],
@@ -216,11 +216,11 @@ def test_a_hook_after_a_stage_may_read_no_more_than_those_in_it(hook: str, tmp_p
     record = execute(RunSpec(TOY, "leaky:Late", 0, {"hook": hook}), tmp_path)
     assert record.error is not None
     assert record.error["where"] == f"{hook}() after stage 0"
-    assert "loads questions by itself" in record.error["message"]
+    assert "loads the questions itself" in record.error["message"]
 
 
 def test_a_hook_that_restores_a_state_may_read_no_more() -> None:
-    with pytest.raises(ContractError, match="loads questions by itself"):
+    with pytest.raises(ContractError, match="loads the questions itself"):
         check_method(load_method("leaky:Late"), hook="load_state")
 
 

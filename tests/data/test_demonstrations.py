@@ -24,6 +24,7 @@ from clbench.data.demonstrations import (
     dataset_folder,
     dataset_id,
     demonstrate,
+    has_dataset,
     read_dataset,
 )
 from clbench.spec.budget import Budget
@@ -101,6 +102,17 @@ def test_a_torn_dataset_is_named_and_made_again(empty_caches: Path, caplog: pyte
     with caplog.at_level(logging.WARNING):
         assert same_demonstrations(read_dataset(dataset_folder(TASK, BUDGET)), before)
     assert f"{folder} is torn" in caplog.text
+
+
+@pytest.mark.parametrize("place", ["", "~/data"])
+def test_an_empty_place_of_minari_is_no_folder_and_a_tilde_is_the_home(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("MINARI_DATASETS_PATH", place)
+    folder = dataset_folder(TASK, BUDGET)
+    assert folder == tmp_path / (place[2:] or ".minari/datasets") / dataset_id(TASK, BUDGET)
+    assert has_dataset(TASK, BUDGET)
 
 
 @pytest.mark.long

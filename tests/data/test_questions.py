@@ -96,7 +96,9 @@ def test_an_answer_that_no_state_gives_is_named() -> None:
     kind = QuestionKind(
         "place", ("where is it",), ("left", "right"), lambda states: np.zeros(len(states), np.int64)
     )
-    with pytest.raises(ValueError, match="No state answers 'right' to 'place': 'where is it'"):
+    with pytest.raises(
+        ValueError, match="No state gives the answer 'right' to the question 'place': 'where is it'"
+    ):
         Questions((kind,), torch.zeros(5, 4))
 
 

@@ -358,21 +358,22 @@ def test_an_impossible_action_is_an_error_that_names_it(scenario: Scenario) -> N
         for number in (np.nan, np.inf, -np.inf):
             bad = good.copy()
             bad[-1] = number
-            message = re.escape(f"is finite, not {bad.tolist()}")
+            message = re.escape(f"must be finite, not {bad.tolist()}")
             with pytest.raises(ValueError, match=message):
                 plain.step(bad)
             with pytest.raises(ValueError, match=message):
                 lanes.step([0, 1], np.stack([good, bad]))
         longer = np.zeros(size + 1, np.float32)
-        message = re.escape(f"has shape ({size},), not ({size + 1},)")
+        message = re.escape(f"must have shape ({size},), not ({size + 1},)")
         with pytest.raises(ValueError, match=message):
             plain.step(longer)
         with pytest.raises(ValueError, match=message):
             lanes.step([0, 1], np.stack([longer, longer]))
-        with pytest.raises(ValueError, match=re.escape(f"has shape ({size},), not (1, {size})")):
+        with pytest.raises(ValueError, match=re.escape(f"must have shape ({size},), not (1, {size})")):
             plain.step(good[None])
         for rows in (1, 3):  # NumPy would repeat the one, and leave out the third
-            with pytest.raises(ValueError, match=f"2 lanes of the .* world take as many actions, not {rows}"):
+            message = f"2 lanes of the .* world need one action each, not {rows} in total"
+            with pytest.raises(ValueError, match=message):
                 lanes.step([0, 1], np.stack([good] * rows))
 
 
@@ -435,5 +436,7 @@ def test_scenes_of_background_tasks_give_the_answers_that_retained_skills_lack()
     make(scenario.tasks[0]).close()
     few = dataclasses.replace(scenario, budget=dataclasses.replace(scenario.budget, question_episodes=64))
     assert all(questions.kinds for questions in load_questions(few))
-    with pytest.raises(InputError, match="No state answers 'left' to 'target_side_of_object'"):
+    with pytest.raises(
+        InputError, match="No state gives the answer 'left' to the question 'target_side_of_object'"
+    ):
         load_questions(dataclasses.replace(few, scenes=()))

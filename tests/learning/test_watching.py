@@ -14,6 +14,7 @@ import clbench
 from clbench.base.cache import cache_folder
 from clbench.base.progress import no_progress
 from clbench.learning.optimise import MethodError
+from clbench.learning.pretraining import pretrain
 from clbench.learning.watching import watch, watches
 from clbench.policy.transformer import TransformerPolicy
 from clbench.testing import ContractError, check_method
@@ -98,6 +99,15 @@ def test_a_method_sees_every_step_and_pays_for_it(
     (state,) = (cache_folder() / "watched").glob("*/method.json")
     seen = {"step": steps, "steps": steps, "calls": steps + 1, "gradients": 1.0}
     assert json.loads(state.read_text(encoding="utf-8")) == seen
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_a_pretraining_from_the_cache_counts_as_many_steps_as_a_watched_one() -> None:
+    pretrained = pretrain(TINY, 0, no_progress)
+    for _ in range(2):
+        steps: list[float] = []
+        watch(Careful(), pretrained, TINY, 0, nullcontext, steps.append)
+        assert sum(steps) == TINY.budget.pretraining_steps
 
 
 def test_only_a_method_that_overrides_the_hook_watches() -> None:

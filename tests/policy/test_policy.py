@@ -317,11 +317,14 @@ def _poison(folder: Path) -> None:
         (_set(width="32"), "width must be a whole number from 1 to 65,536, not '32'"),
         (_set(layers=10**12), "layers must be a whole number from 1 to 65,536"),
         (_set(heads=5), "width 32 cannot be shared among 5 heads"),
-        (_set(width=1, heads=1, layers=65_536), "65,536 layers cannot have"),
+        (
+            _set(width=1, heads=1, layers=65_536),
+            "65,536 layers need at least as many tensors, but the file has",
+        ),
         (_set(width=65_536), "a policy of its sizes has at least .* numbers, but the file has"),
         (_set(image_size=65_536), "a policy of its sizes has at least .* numbers, but the file has"),
         (_set(image_size=20), "pictures of 20 pixels cannot be cut into patches of 16"),
-        (_set(executed=9), "a chunk of 8 steps has no 9 to execute"),
+        (_set(executed=9), "executed must be at most 8, the steps of a chunk, not 9"),
         (_edit(lambda them: them.pop("state_std")), "tensors that do not fit the policy: state_std"),
         (_edit(lambda them: them.update(more=torch.zeros(1))), "do not fit the policy: more"),
         (_edit(lambda them: them.update(state_std=them["state_std"].half())), "do not fit .*: state_std"),
@@ -390,7 +393,7 @@ def test_pixels_are_numbers_from_minus_one_to_one(pixel: int, number: float) -> 
 
 def test_a_policy_with_eyes_refuses_to_act_without_an_image() -> None:
     batch = _batch(2)
-    with pytest.raises(ValueError, match=r"image of \(32, 32, 3\), not none: hand over `batch.image`"):
+    with pytest.raises(ValueError, match=r"images of shape \(32, 32, 3\), not none: pass `batch.image`"):
         TransformerPolicy(SEEING).hidden_states(batch.state, batch.words)
     with pytest.raises(ValueError, match=r"not \(0, 0, 3\)"):
         TransformerPolicy(SEEING).action_loss(batch)

@@ -93,6 +93,6 @@ def test_a_class_is_named_by_a_text_and_has_no_size_of_ours_to_choose() -> None:
     ):
         check_policy_name(object)  # type: ignore[arg-type]
     with pytest.raises(
-        InputError, match="Only flow and discrete_diffusion have sizes; mine:Mine cannot be base"
+        InputError, match="Only flow and discrete_diffusion have sizes; mine:Mine cannot have the size base"
     ):
         policy_name("mine:Mine", "base")

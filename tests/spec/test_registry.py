@@ -59,11 +59,15 @@ def test_nothing_is_imported_before_it_is_used() -> None:
         (
             "clbench/Fetch-v1",
             "clbench.testing:TOY",
-            "is registered already, and not for 'clbench.testing:TOY'",
+            "is already registered, with another entry point than 'clbench.testing:TOY'",
         ),
-        ("me/Mine-v0", "strangers_module", "must be the place of a scenario, as 'package.module:SCENARIO'"),
-        ("me/Mine-v0", "strangers_module.MINE:", "must be the place of a scenario"),
-        ("me/Mine-v0", ":MINE", "must be the place of a scenario"),
+        (
+            "me/Mine-v0",
+            "strangers_module",
+            "The entry point of a scenario must have the form 'package.module:SCENARIO'",
+        ),
+        ("me/Mine-v0", "strangers_module.MINE:", "The entry point of a scenario must have the form"),
+        ("me/Mine-v0", ":MINE", "The entry point of a scenario must have the form"),
     ],
 )
 def test_a_wrong_registration_is_refused_by_name(name: str, entry_point: str, message: str) -> None:
@@ -75,7 +79,7 @@ def test_a_wrong_registration_is_refused_by_name(name: str, entry_point: str, me
     ("entry_point", "message"),
     [
         ("strangers_module:MINNE", "No entry point 'strangers_module:MINNE': .* Did you mean 'MINE'"),
-        ("strangers_module:MORE", "'strangers_module:MORE' is no Scenario but a tuple"),
+        ("strangers_module:MORE", "'strangers_module:MORE' must be a Scenario, not an object of type tuple"),
     ],
 )
 def test_a_place_without_a_scenario_is_named_when_it_is_used(entry_point: str, message: str) -> None:
@@ -107,14 +111,18 @@ def test_an_id_that_the_scenario_does_not_have_is_named() -> None:
         load_scenario("me/Other-v0")
 
 
-def test_a_word_near_to_one_of_the_vocabulary_is_spelled_with_a_warning(
+def test_a_word_near_to_one_of_the_vocabulary_is_spelled_with_one_warning(
     module: types.ModuleType, caplog: pytest.LogCaptureFixture
 ) -> None:
     strange = dataclasses.replace(MINE.target[0], name="odd", instructions=("go wright", "zyx"))
     vars(module).update(ODD=dataclasses.replace(MINE, target=(strange,)))
-    assert opened_scenario("strangers_module:ODD").text_length == 12
+    for _ in range(2):
+        assert opened_scenario("strangers_module:ODD").text_length == 12
     (warning,) = [entry.getMessage() for entry in caplog.records]
-    assert "'wright' is not in the vocabulary, and is spelled. Did you mean 'right'?" in warning
+    assert (
+        "'wright' is not in the vocabulary, so the policy reads it in pieces. Did you mean 'right'?"
+        in warning
+    )
 
 
 def _lambda(state: object) -> object:
@@ -134,11 +142,15 @@ def _lambda(state: object) -> object:
             "expert of right must be a string 'module:name' such as '.*:_lambda'",
         ),
         ({"world": "toy"}, ValueError, "world of right must have the form 'module:name', not 'toy'"),
-        ({"instructions": ()}, ValueError, "task right needs an instruction"),
-        ({"instructions": ("go right", " ")}, ValueError, "none of them may be empty"),
-        ({"instructions": "go right"}, TypeError, "must be a tuple of texts, not one text"),
-        ({"instructions": ["go right"]}, TypeError, r"must be a tuple of texts, not \"\['go right'\]\""),
-        ({"packages": "mujoco"}, TypeError, r"packages of right must be a tuple of texts, .* is \(one,\)"),
+        ({"instructions": ()}, ValueError, "task right needs at least one instruction"),
+        ({"instructions": ("go right", " ")}, ValueError, "no instruction may be empty"),
+        ({"instructions": "go right"}, TypeError, "must be a tuple of strings, not one string"),
+        ({"instructions": ["go right"]}, TypeError, r"must be a tuple of strings, not \"\['go right'\]\""),
+        (
+            {"packages": "mujoco"},
+            TypeError,
+            r"packages of right must be a tuple of strings, .* as \(entry,\)",
+        ),
         ({"name": "../right"}, ValueError, "cannot be the name of a task"),
         ({"name": "v2.right"}, ValueError, "cannot be the name of a task: letters, digits, _ and - only"),
         ({"suite": "me/table"}, ValueError, "'me/table' cannot be the suite of a task"),
@@ -152,7 +164,9 @@ def test_an_impossible_task_is_refused_where_it_is_built(
 
 
 def test_a_scenario_that_has_nothing_to_ask_about_is_refused_where_it_is_built() -> None:
-    with pytest.raises(ValueError, match=r"without retained tasks it needs scenes, .* scenes=target"):
+    with pytest.raises(
+        ValueError, match=r"a scenario without retained tasks needs scenes \(.*\), .* scenes=target"
+    ):
         dataclasses.replace(TOY, retained=())
     assert dataclasses.replace(TOY, retained=(), scenes=TOY.target).scene_tasks == TOY.target
     with pytest.raises(TypeError, match="questions of clbench/Toy-v0 must be a string 'module:name'"):
@@ -168,7 +182,7 @@ def test_a_scenario_that_has_nothing_to_ask_about_is_refused_where_it_is_built()
         ),
         (
             {"held_out": TOY.held_out[0]},
-            r"must be a tuple of Tasks, not one Task; a tuple of one is \(one,\)",
+            r"must be a tuple of Tasks, not one Task; write a tuple with one entry as \(entry,\)",
         ),
         (
             {"budget": {"demonstrations": 3}},

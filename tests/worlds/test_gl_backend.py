@@ -80,7 +80,9 @@ def test_the_choice_of_the_user_is_obeyed(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setenv("MUJOCO_GL", "glfw")
     assert choose_back_end([WORLD]) == "glfw"
     monkeypatch.setenv("MUJOCO_GL", "cgl")
-    with pytest.raises(RenderingError, match="MUJOCO_GL is set to cgl: unset it, and what works is chosen"):
+    with pytest.raises(
+        RenderingError, match="MUJOCO_GL is set to cgl: unset it, and clbench chooses what works"
+    ):
         choose_back_end([WORLD])
     assert tried == ["glfw", "cgl"]
 

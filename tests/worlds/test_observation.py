@@ -230,9 +230,7 @@ def test_a_process_that_dies_is_named_with_its_last_words(
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
     observer = Observer(TASK.world, "dim:Dim")
-    with pytest.raises(
-        RenderingError, match="process of dim:Dim that draws has ended: RuntimeError: no light"
-    ):
+    with pytest.raises(RenderingError, match="drawing process of dim:Dim has ended: RuntimeError: no light"):
         observer.observe(_states(2))
     observer.close()
 

@@ -255,7 +255,8 @@ def test_wrong_calls_are_refused_by_name() -> None:
         env.reset(seed=[1, 2, 3])
     env.reset(seed=0)
     for actions in (env.single_action_space.sample(), env.action_space.sample()[:1]):
-        with pytest.raises(ValueError, match=r"The actions must have shape \(2, 2\), not .*: a row each"):
+        message = r"The actions must have shape \(2, 2\), not .*: one row per environment"
+        with pytest.raises(ValueError, match=message):
             env.step(actions)
     with pytest.raises(LookupError, match="Did you mean 'left'"):
         env.reset(options={"task": "lefft"})
