@@ -1,6 +1,7 @@
 """The worked examples of `docs/guide/your_method.md`, run unchanged, as a stranger would."""
 
 import copy
+import dataclasses
 import importlib
 import re
 import sys
@@ -13,11 +14,13 @@ import pytest
 import torch
 
 import clbench
-from clbench.learning.method import Progress, Stage
+from clbench.learning.method import Method, Progress, Stage
 from clbench.learning.prior import Nothing, Prior, Source
+from clbench.policy.policy import Policy
 from clbench.policy.transformer import TransformerPolicy
 from clbench.testing import TOY, check_method
 from clbench.testing.small import SMALL, toy_source
+from clbench.testing.toy_run import ToyRun
 
 PAGE = Path(__file__).parents[1] / "docs" / "guide" / "your_method.md"
 
@@ -30,7 +33,8 @@ def blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     found = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
     monkeypatch.syspath_prepend(tmp_path)
     names = {"der": 0, "si": 2, "prompt": 4, "teacher": 5}
-    for name, text in ((name, found[number]) for name, number in names.items()):
+    files = {name: found[number] for name, number in names.items()} | {"recipes": "\n".join(found[6:])}
+    for name, text in files.items():
         (tmp_path / f"{name}.py").write_text(text, encoding="utf-8")
         monkeypatch.delitem(sys.modules, name, raising=False)
     return found
@@ -40,6 +44,92 @@ def blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def der(blocks: list[str]) -> Any:
     """Return the method of the page."""
     return importlib.import_module("der").DER(kept=8)
+
+
+def recipe(name: str) -> Any:
+    """Return a method of the recipes, with what they leave out."""
+    cls = getattr(importlib.import_module("recipes"), name)
+    cls.__doc__ = "A recipe."
+    return dataclasses.dataclass(cls)
+
+
+@dataclasses.dataclass
+class Visits(Method):
+    """Keeps the states that its policy visits."""
+
+    scenario: str = "clbench.testing:clbench/Toy-v0"
+
+    def end_task(self, policy: Policy, stage: Stage) -> None:
+        self.seen = torch.tensor(np.stack(sys.modules["recipes"].visited(policy, self.scenario, stage)))
+
+    def diagnostics(self) -> dict[str, Any]:
+        return {"seen": self.seen.tolist()} if hasattr(self, "seen") else {}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["EMA", "SAM", "Calm"])
+@pytest.mark.usefixtures("blocks")
+def test_its_recipes_keep_the_contract(name: str) -> None:
+    check_method(recipe(name))
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("blocks")
+def test_its_recipe_for_episodes_returns_the_states_of_one_and_keeps_the_contract() -> None:
+    importlib.import_module("recipes")
+    check_method(Visits)
+    run = ToyRun(Visits, targets=1, steps=2)
+    seen = run.outcomes["stage 1 (right)", "diagnostics"]["seen"]
+    assert 2 <= len(seen) <= TOY.task("right").horizon
+    assert all(len(state) == 4 for state in seen)
+    moved = np.abs(np.diff(np.array(seen), axis=0)[:, :2]).max(axis=1)
+    assert np.all((moved > 0) & (moved < 0.21))
+
+
+@pytest.mark.usefixtures("blocks")
+def test_its_average_follows_the_weights_and_is_in_the_policy_at_the_end() -> None:
+    method, policy, source = recipe("EMA")(), TransformerPolicy(SMALL), toy_source("right")
+    stage = Stage(1, TOY.task("right"), 0, 10, source, Prior({}))
+    begun = flat(method.start_task(policy, stage))
+    method.loss(policy, source.sample(4), Progress(0, 10))
+    with torch.no_grad():
+        for one in policy.parameters():
+            one.add_(1.0)
+    method.end_task(policy, stage)
+    np.testing.assert_allclose(flat(policy.parameters()), begun + 0.01, atol=1e-5)
+
+
+@pytest.mark.usefixtures("blocks")
+def test_its_second_pass_has_the_gradient_at_the_worst_weights_and_returns_to_the_weights() -> None:
+    method, policy, batch = recipe("SAM")(), TransformerPolicy(SMALL), toy_source("right").sample(8)
+    before = flat(policy.parameters())
+    method.gradients(policy, method.loss(policy, batch, Progress(0, 10)))
+    assert np.array_equal(flat(policy.parameters()), before)
+    twin = TransformerPolicy(SMALL)
+    weights = list(twin.parameters())
+    slopes = torch.autograd.grad(twin.action_loss(batch).mean(), weights, materialize_grads=True)
+    length = float(np.linalg.norm(flat(slopes)))
+    with torch.no_grad():
+        for one, slope in zip(weights, slopes, strict=True):
+            one.add_(0.05 * slope / length)
+    torch.autograd.backward(twin.action_loss(batch).mean())
+    ours, theirs = (
+        flat([one.grad for one in model.parameters() if one.grad is not None]) for model in (policy, twin)
+    )
+    np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-6)
+    assert not np.allclose(ours, flat([one for one in slopes if one.any()]), rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.usefixtures("blocks")
+def test_its_act_halves_the_noise_where_all_words_are_known() -> None:
+    method, policy = recipe("Calm")(), TransformerPolicy(SMALL)
+    method.prepare(policy, Prior({}))
+    method.start_task(policy, Stage(1, TOY.task("right"), 0, 10, toy_source("right"), Prior({})))
+    plain = TransformerPolicy(SMALL)
+    for task, factor in (("right", 0.5), ("left", 1.0)):
+        batch = toy_source(task).sample(4)
+        expected = plain.act(batch.state, batch.words, factor * batch.noise)
+        assert policy.act(batch.state, batch.words, batch.noise).equal(expected)
 
 
 @pytest.mark.long

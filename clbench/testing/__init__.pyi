@@ -1,7 +1,7 @@
+from .clauses import Check as Check
+from .clauses import ContractError as ContractError
 from .contract import check_method as check_method
 from .contract import method_checks as method_checks
-from .error import Check as Check
-from .error import ContractError as ContractError
 from .policy_contract import check_policy as check_policy
 from .policy_contract import policy_checks as policy_checks
 from .scenario import ScenarioError as ScenarioError

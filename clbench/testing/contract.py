@@ -36,7 +36,14 @@ from clbench.policy.policy import ABILITIES
 from clbench.runs.spec import is_setting
 from clbench.runs.tuning import values_of_strength
 from clbench.spec.policies import DEFAULT_POLICY
-from clbench.testing.error import Check, ContractError
+from clbench.testing.clauses import (
+    Check,
+    ContractError,
+    check_copy,
+    check_ends,
+    check_step_factor,
+    check_steps_at_end,
+)
 from clbench.testing.global_state import GENERATORS, same, watched
 from clbench.testing.toy_run import ToyRun, frozen_return, mean_return
 
@@ -53,6 +60,9 @@ policy needs more than 40."""
 LEAST_GAIN = 1.0
 """Least rise of the mean return in these steps. Plain fine-tuning gains 16, from -17.6 to -1.3; the built-in
 method that moves least, `finch`, gains 2.1."""
+
+SLOWER = 0.3
+"""Factor of the learning rate in a run that must leave other weights. Tuning tries it for every method."""
 
 PRIOR = ("demonstrations", "questions")
 """Kinds of prior data, by the fields of `Uses`."""
@@ -101,14 +111,14 @@ class Subject:
     def __init__(self, cls: type[Method], settings: Mapping[str, Any], policy: str) -> None:
         self.cls, self.settings, self.policy = cls, settings, policy
 
-    def build(self) -> Method:
-        """Return a new object of the method.
+    def build(self, **changes: Any) -> Method:
+        """Return a new object of the method, with changes of its settings.
 
         Raises:
             ContractError: The class refuses its defaults, or the settings.
         """
         try:
-            return self.cls(**self.settings)
+            return self.cls(**{**self.settings, **changes})
         except Exception as error:
             found = f"{type(error).__name__}: {error}"
             raise _misbuilt(
@@ -140,6 +150,12 @@ class Subject:
     def longer(self) -> ToyRun:
         """A run with another seed, long enough to learn the first target."""
         return ToyRun(self.build, 1, LEARNING_STEPS, seed=1, policy=self.policy)
+
+    @cached_property
+    def slower(self) -> ToyRun:
+        """The first stage of `first` with a smaller `step_factor`."""
+        factor = SLOWER * self.build().step_factor
+        return ToyRun(lambda: self.build(step_factor=factor), 1, STEPS, policy=self.policy)
 
 
 # ---- the clauses -------------------------------------------------------------------------------------------
@@ -303,8 +319,9 @@ def _misbuilt(expected: str, found: str) -> ContractError:
 
 
 def sound_hooks(subject: Subject) -> None:
-    """Hooks run without an error, and return values that the loop can use."""
-    _ = subject.first, subject.longer
+    """Hooks run without an error, and return what the loop can use; a copy of the policy acts alone."""
+    _ = subject.first
+    check_copy(subject.longer.trainer.policy, subject.longer.samples)
 
 
 def declared_data(subject: Subject) -> None:
@@ -355,8 +372,8 @@ def state(subject: Subject) -> None:
 
 
 def criterion(subject: Subject) -> None:
-    """The hooks run in stages that end early: at a check, or before the first step."""
-    _ = subject.first  # its faults have nothing to do with the criterion
+    """Checks play the policy that a stage leaves, and hooks run in stages that end early, even at step 0."""
+    check_ends(subject.first.merges or subject.longer.merges, subject.cls.whole_stages)
     try:
         _ = subject.to_criterion
     except ContractError as error:
@@ -368,6 +385,7 @@ def criterion(subject: Subject) -> None:
         )
         look = "end_task() and state(), and the attributes that the hooks of a step set for them"
         raise _breach(criterion, expected, error.found, look) from error
+    check_steps_at_end(subject.to_criterion.steps_of_merges)
 
 
 def global_state(subject: Subject) -> None:
@@ -401,6 +419,7 @@ def learning(subject: Subject) -> None:
             f"{after:.1f}, with {before:.1f} before",
             "start_task(), loss(), gradients() and learning_rate()",
         )
+    check_step_factor(subject.first.weights(1), subject.slower.weights(1), SLOWER)
 
 
 CLAUSES = (

@@ -28,7 +28,7 @@ from clbench.policy.batch import Batch, QuestionBatch
 from clbench.policy.checkpoint import load_policy, save_policy
 from clbench.policy.kinds import new_policy, policy_class
 from clbench.policy.policy import ABILITIES, Policy, PolicyConfig
-from clbench.testing.error import Check, ContractError
+from clbench.testing.clauses import Check, ContractError
 from clbench.testing.global_state import GENERATORS, read, same
 from clbench.testing.small import SMALL, toy_questions, toy_source
 

@@ -11,6 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from clbench.base.entry_points import unknown
+from clbench.data.access import check_episodes
 from clbench.data.questions import QuestionKind
 from clbench.spec.budget import Budget
 from clbench.spec.scenario import Scenario
@@ -64,7 +65,12 @@ class ToyWorld(gymnasium.Env[State, Action]):
         return self._state.copy(), {"task": self._task, "success": False}
 
     def step(self, action: Action) -> tuple[State, float, bool, bool, dict[str, Any]]:
-        """Move the point by a fifth of the velocity, divided by its mass."""
+        """Move the point by a fifth of the velocity, divided by its mass.
+
+        Raises:
+            LeakError: A hook of a method plays a task whose demonstrations it may not read.
+        """
+        check_episodes([(self._task, "validation")])  # Gymnasium knows no splits
         self._state[:2] += 0.2 / self._mass * np.clip(np.asarray(action, np.float32), -1.0, 1.0)
         error = float(np.abs(self._start + _DIRECTIONS[self._task] - self._state[:2]).max())
         success = error < 0.3

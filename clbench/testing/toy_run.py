@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
+import inspect
 import itertools
 import json
 import tempfile
@@ -17,9 +18,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from clbench.base.seeding import seeded
+from clbench.base.seeding import seeded, torch_generator
 from clbench.base.strict_json import StrictJSONError, check_json
 from clbench.base.text import counted, did_you_mean
+from clbench.data.access import LeakError
+from clbench.data.demonstrations import Demonstrations
 from clbench.data.training_data import TrainingData
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.adaptation import Step
@@ -33,8 +36,9 @@ from clbench.learning.watching import watches
 from clbench.policy.batch import Batch, QuestionBatch
 from clbench.policy.checkpoint import CheckpointError
 from clbench.policy.policy import Policy
+from clbench.runs.fingerprint import arithmetic_hash
 from clbench.spec.policies import DEFAULT_POLICY
-from clbench.testing.error import ContractError
+from clbench.testing.clauses import ContractError, actions_of, moved
 from clbench.testing.global_state import GENERATORS, forgetting, read, same, watched
 from clbench.testing.toy import TOY
 
@@ -51,14 +55,26 @@ SOUND = {
 }
 """Result that the loop needs from a hook."""
 
+GROUP_KEYS = {"name", *inspect.signature(torch.optim.AdamW).parameters}
+"""Keys that a group of parameters may have: those that AdamW reads, and a name, which nothing reads."""
+
 _numbers = itertools.count()
 
 
 @functools.cache
 def toy_data(policy: str) -> tuple[TrainingData, Policy]:
     """Return the data and a pretrained policy of the toy; reading them takes a second."""
+    arithmetic_hash()  # its optimiser steps, once in a process, must not count as those of a method
     pretrained, _ = pretrained_policy(TOY.with_policy(policy), 0)
     return TrainingData.open(TOY, pretrained.config), pretrained
+
+
+@functools.cache
+def some_samples(policy: str) -> Batch:
+    """Return a batch of the toy's targets, on which policies act; no run draws it."""
+    data, _ = toy_data(policy)
+    known = Demonstrations.cat([data.demonstrations(task) for task in TOY.target])
+    return Source(known, torch_generator("some samples"), TOY.budget.batch_size).sample(16)
 
 
 @functools.cache
@@ -111,6 +127,12 @@ class ToyRun:
         """Weights, state and diagnostics, by stage and name."""
         self.generators: dict[str, dict[str, Any]] = {}
         """Global random generators after the first call of each hook for which a run seeds them."""
+        self.merges = False
+        """Whether a call of `end_task` changed the actions of the policy."""
+        self.steps_of_merges = 0
+        """Most optimiser steps in a call of `end_task` that changed the actions of the policy."""
+        self.samples = some_samples(policy)
+        """Samples on which the policy acts before and after each `end_task`."""
         self._build, self._hook, self._running = build, "prepare", False
         self._earlier: list[Method | Policy] = []
         """Objects of the method, and policies, that the run has had."""
@@ -171,6 +193,11 @@ class ToyRun:
             return words
         return None
 
+    def weights(self, number: int) -> dict[str, Tensor]:
+        """Return all tensors of the policy after stage `number`."""
+        stage = f"stage {number} ({self.trainer.scenario.target[number - 1].name})"
+        return {name: self.outcomes[stage, name] for name in self.trainer.policy.state_dict()}
+
     def hooks_that_draw(self, source: str) -> set[str]:
         """Return the hooks that draw samples from a source."""
         return {hook for one, hook in self.draws if one == source}
@@ -216,6 +243,7 @@ class ToyRun:
         if self._running:  # the method calls one of its own hooks
             return function(*arguments, **named)
         self._hook, self._running = hook, True
+        acted = actions_of(arguments[0], self.samples) if hook == "end_task" else None
         changes: list[str] = []
         try:
             with watched(changes, generators=hook in UNSEEDED), steps_counted() as taken:
@@ -228,6 +256,8 @@ class ToyRun:
         if hook == "start_task" and taken():  # runs refuse it where a criterion ends the stage
             expected = "no optimiser steps: a target is learned in the steps that follow"
             raise _unsound("start_task", expected, counted(taken(), "step"))
+        if acted is not None and moved(acted, actions_of(arguments[0], self.samples)):
+            self.merges, self.steps_of_merges = True, max(self.steps_of_merges, taken())
         if hook not in (*UNSEEDED, "load_state"):
             self.generators.setdefault(hook, read(GENERATORS))
         check = getattr(self, f"_checked_{hook}", None)
@@ -242,6 +272,12 @@ class ToyRun:
             expected = (
                 f"{hook}() to draw from its arguments: at most a batch of the target in a step, and only the "
                 "prior data that `uses` declares"
+            )
+        elif isinstance(error, LeakError):
+            clause, found = "declared data", str(error)
+            expected = (
+                f"{hook}() to read, and play validation episodes of, only its own target and the tasks whose "
+                "demonstrations `uses` declares"
             )
         elif isinstance(error, AttributeError) and error.name and isinstance(error.obj, Method | nn.Module):
             found = f"{hook}() finds no attribute {error.name!r} in the {type(error.obj).__name__}"
@@ -274,6 +310,10 @@ class ToyRun:
         except (TypeError, ValueError, KeyError) as error:
             found = type(parameters).__name__ if parameters is None else str(error)
             raise _unsound("start_task", SOUND["start_task"], found) from error
+        unknown = sorted({key for one in groups if isinstance(one, dict) for key in one} - GROUP_KEYS)
+        if unknown:
+            expected = "groups with keys that AdamW reads, such as `lr`, a group's learning rate, or `name`"
+            raise _unsound("start_task", expected, f"{', '.join(map(repr, unknown))}, which no step reads")
         trained = [parameter for group in made for parameter in group["params"]]
         if not trained and not self.uses.reference:
             expected = "parameters to train; only a reference, `uses = Uses(reference=True)`, may train none"
