@@ -78,7 +78,7 @@ def _of_seeds(board: Board, boards: Mapping[str, list[Row]]) -> tuple[list[str],
         lines.append((short(name), _w_text(every), _w_text(alone), *_shares_of_variance(without)))
     answers = [
         f"The seeds agree on the order of the methods{which} more than chance would explain on {sum(found)} "
-        f"of {counted(len(found), 'scenario')}."
+        f"of {counted(len(found), 'scenario')} with enough methods."
         for which, found in certain.items()
         if found
     ]

@@ -136,7 +136,7 @@ def claims_section(judged: Sequence[Judged]) -> Section:
         f"{_uncounted(every)}"
         for paper, every in grouped((one.claim.paper.name, one) for one in judged).items()
     ]
-    explained = Table(("claim", "scenario", "verdict", "what explains it"), tuple(_explanations(judged)))
+    explained = Table(("claim", "scenario", "verdict", "remark"), tuple(_explanations(judged)))
     tables = [table for table in (_plain(verdicts(judged)), explained) if table.lines]
     is_made = any(one.claim.scenarios == KNOWLEDGE for one in judged)
     notes = (UNDECIDED, HOW_IT_WAS_MADE) if is_made else (UNDECIDED,)

@@ -7,6 +7,7 @@ and interval.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from operator import itemgetter
 
 from clbench.base.text import counted, listed
 from clbench.records.paths import table_parts
@@ -126,7 +127,7 @@ def _usual(board: Board) -> dict[str, list[Row]]:
 def _knowledge(boards: dict[str, list[Row]]) -> Section:
     """Return whether skills and answers to questions are lost together."""
     lines: list[tuple[str, ...]] = []
-    losses: list[tuple[bool, float, float]] = []
+    losses: list[tuple[bool, str, float, float]] = []
     for name, rows in boards.items():
         by_method = {row.method: row for row in rows}
         if BASELINE not in by_method or FROZEN not in by_method:
@@ -136,7 +137,7 @@ def _knowledge(boards: dict[str, list[Row]]) -> Section:
             continue
         to_criterion = by_method[BASELINE].to_criterion
         skills, answers = ((before[one], after[one]) for one in ("retention", "question_retention"))
-        losses.append((to_criterion, _loss(*skills), _loss(*answers)))
+        losses.append((to_criterion, short(name), _loss(*skills), _loss(*answers)))
         stages = "to the criterion" if to_criterion else "of a fixed length"
         lines.append((short(name), stages, _change(*skills), _change(*answers)))
     head = ("scenario", "stages", "success on the skills", "share of correct answers")
@@ -155,16 +156,16 @@ def _loss(before: Estimate, after: Estimate) -> float:
     return 0.0 if before.value is None or after.value is None else before.value - after.value
 
 
-def _largest_losses(losses: Sequence[tuple[bool, float, float]]) -> list[str]:
-    """Return the largest losses of skills and answers, for stages of each kind."""
+def _largest_losses(losses: Sequence[tuple[bool, str, float, float]]) -> list[str]:
+    """Return the largest losses of skills and of answers, for stages of each kind, with their scenarios."""
     sentences = []
     for kind, words in ((True, "end at the criterion"), (False, "have a fixed length")):
-        found = [one for one in losses if one[0] == kind]
+        found = [one[1:] for one in losses if one[0] == kind]
         if found:
-            _, skills, answers = (max(values) for values in zip(*found, strict=True))
+            skills, answers = (max(found, key=itemgetter(place)) for place in (1, 2))
             sentences.append(
-                f"Where stages {words}, plain fine-tuning loses up to {skills:.2f} of the success on the "
-                f"skills and up to {answers:.2f} of the answers."
+                f"Where stages {words}, success on the skills falls by up to {skills[1]:.2f} ({skills[0]}), "
+                f"and the share of correct answers by up to {answers[2]:.2f} ({answers[0]})."
             )
     return sentences
 
@@ -209,7 +210,7 @@ def _of_a_policy(scenario: str, policy: str, comparisons: Sequence[Comparison]) 
     apart = [one.estimates[FORGOTTEN_BY][2] for one in comparisons if one.seeds > 1]
     if not apart:
         return [
-            f"On {short(scenario)} with {policy}, there is only one seed, which shows nothing for certain."
+            f"On {short(scenario)} with {policy}, there is only one seed, so the table gives no interval."
         ]
     lower = sum(one.is_below(0) for one in apart)
     higher = sum(one.is_above(0) for one in apart)

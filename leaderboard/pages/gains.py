@@ -31,8 +31,8 @@ def by_gain(rows: Iterable[Row]) -> list[Row]:
 
 FAMILY = (
     "Methods are told apart from plain fine-tuning by Tukey's test of all methods without prior "
-    "demonstrations on the scenario. The last column has the other gains whose own intervals exclude 0; they "
-    "are not corrected for the number of methods."
+    "demonstrations on the scenario; what a gain must exceed depends on the method. The last column has the "
+    "other gains whose own intervals exclude 0; they are not corrected for the number of methods."
 )
 
 
@@ -54,9 +54,9 @@ def gains_section(boards: Mapping[str, Sequence[Row]], tied: Tied) -> Section:
         answers.insert(0, f"On {where}, no method is above plain fine-tuning and told apart from it.")
     for name in judged:
         answers += _over_tied_settings(name, tied.get(name, {}))
-    head = ("scenario", "compared", "largest gain", "smallest gain that is told apart", "told apart")
+    head = ("scenario", "compared", "largest gain", "a gain must exceed", "told apart")
     lines = tuple(_gain_line(name, rows, tied.get(name, {})) for name, rows in judged.items())
-    tables = (Table((*head, "only by the own interval"), lines),) if lines else ()
+    tables = (Table((*head, "interval excludes 0, not told apart"), lines),) if lines else ()
     question = "Does a method without prior demonstrations beat tuned fine-tuning?"
     picture = "gains" if any(by_gain(rows) for rows in boards.values()) else ""
     return Section(question, tuple(answers), tables, (FAMILY,) if lines else (), picture)
@@ -90,36 +90,31 @@ def _gain_line(
     others = _without_demonstrations(rows)
     gains = {row.method: row.estimates["gain"] for row in others}
     apart = sides_of_gains(rows, tied)
-    best = next(iter(gains))
-    told = [
-        f"{_named(method, gains[method])}{_unlearned(others, method)}" for method in gains if method in apart
-    ]
+    cells = {row.method: _gain_cell(row, tied.get(row.method, ())) for row in others}
+    told = [cells[method] for method in gains if method in apart]
     alone = [
-        f"{_named(method, gain)}{_lost_over_tied(gain, tied.get(method, ()))}"
+        cells[method]
         for method, gain in gains.items()
         if method not in apart and (gain.is_above(0) or gain.is_below(0))
     ]
     compared = f"{counted(len(gains), 'method')}, {counted(len(others[0].seeds), 'seed')}"
     needed = _smallest_told_apart(rows, gains)
     return (
-        *(short(name), compared, _named(best, gains[best]), needed),
+        *(short(name), compared, cells[others[0].method], needed),
         *("; ".join(told) or MISSING, "; ".join(alone) or MISSING),
     )
 
 
-def _named(method: str, gain: Estimate) -> str:
-    return f"`{method}` {format_interval(gain, '.3f')}"
-
-
-def _lost_over_tied(gain: Estimate, tied: Sequence[TiedGain]) -> str:
-    """Return a remark on a gain that is above the chosen setting of plain fine-tuning, but not a tied one."""
-    return " (not over the tied setting)" if gain.is_above(0) and side_of_zero(gain, tied) != 1 else ""
-
-
-def _unlearned(rows: Iterable[Row], method: str) -> str:
-    """Return a remark on a method some of whose stages ended without the criterion."""
-    met = next(row.estimates["criterion_met"].value for row in rows if row.method == method)
-    return "" if met is None or met == 1 else f" ({1 - met:.0%} of its stages missed the criterion)"
+def _gain_cell(row: Row, tied: Sequence[TiedGain]) -> str:
+    """Return a method with its gain, and what speaks against reading it alone."""
+    gain, met = row.estimates["gain"], row.estimates["criterion_met"].value
+    remarks = []
+    if gain.is_above(0) and side_of_zero(gain, tied) != 1:
+        remarks.append("not over the tied setting")
+    if met is not None and met < 1:
+        remarks.append(f"{1 - met:.0%} of its stages missed the criterion")
+    remark = f" ({'; '.join(remarks)})" if remarks else ""
+    return f"`{row.method}` {format_interval(gain, '.3f')}{remark}"
 
 
 def _smallest_told_apart(rows: Iterable[Row], methods: Collection[str]) -> str:
@@ -190,7 +185,7 @@ def replay_section(boards: Mapping[str, Sequence[Row]], tied: Tied) -> Section:
         "gain",
         "kept between stages",
         "steps to learn a target",
-        "stages that missed",
+        "stages that missed the criterion",
     )
     return Section(question, (answer,), (Table(head, tuple(lines)),), (WHAT_IS_KEPT, OWN_RATES))
 

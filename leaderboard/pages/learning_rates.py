@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from clbench.base.text import counted
+from clbench.scoring.intervals import Estimate
 from clbench.spec.references import BASELINE, FROZEN
 
 from ..board.frontier import Curve, Rung
@@ -18,8 +19,8 @@ from ..views.sections import Section, Table, short
 Curves = Mapping[str, Sequence[Curve]]
 
 NOTES = (
-    "Rates and methods marked as best were chosen on the same episodes, so differences from them are biased "
-    "upwards. All differences are paired by seed.",
+    "The best rate and the best method were chosen on the same episodes. What a smaller rate gains is "
+    "therefore biased upwards; the other differences may be biased either way. All are paired by seed.",
     f"`{FROZEN}` learns nothing. A target that was never learned counts as not kept.",
     "Factors multiply the scenario's learning rate. The leaderboard has all of them, with intervals.",
 )
@@ -91,19 +92,18 @@ class _Ladder:
         others = self._others()
         rival = others[0] if others else None
         label = rung(rival.method, self.first.factor) if rival else ""
-        frozen = next((row.estimates["kept"] for row in self.rows if row.method == FROZEN), None)
+        frozen = next((row for row in self.rows if row.method == FROZEN), None)
         return {
-            "plain fine-tuning at the largest rate": _at(self.first),
+            "plain fine-tuning at the scenario's learning rate": _at(self.first),
             "plain fine-tuning at its best rate": f"{_at(self.best)}, best of {len(self.baseline.rungs)}",
-            "best method without prior demonstrations at the largest rate": (
-                f"`{rival.method}` {format_interval(rival.rungs[0].kept)}, "
-                f"best of {counted(len(others), 'method')}"
+            "best method without prior demonstrations at the scenario's learning rate": (
+                f"`{rival.method}` {_at(rival.rungs[0])}, best of {counted(len(others), 'method')}"
                 if rival
                 else MISSING
             ),
-            "this method minus plain fine-tuning at the largest rate": self._more(label, first),
+            "this method minus plain fine-tuning at the scenario's learning rate": self._more(label, first),
             "this method minus plain fine-tuning at its best rate": self._more(label, best),
-            f"`{FROZEN}`": format_interval(frozen) if frozen else MISSING,
+            f"`{FROZEN}`": _with_seeds(frozen.estimates["kept"], frozen.seeds) if frozen else MISSING,
             f"plain fine-tuning at its best rate minus `{FROZEN}`": self._more(
                 best, FROZEN if frozen else ""
             ),
@@ -125,8 +125,14 @@ class _Ladder:
         if not method or not other:
             return MISSING
         found = self.evidence.difference("kept", method, other)
-        return f"{format_interval(found.estimate)}, {counted(len(found.seeds), 'seed')}"
+        return _with_seeds(found.estimate, found.seeds)
 
 
 def _at(one: Rung) -> str:
-    return f"{format_interval(one.kept)} at factor {one.factor:g}"
+    """Return what a rate keeps, and the rate if it is not the scenario's."""
+    rate = "" if one.factor == 1 else f" at factor {one.factor:g}"
+    return f"{_with_seeds(one.kept, one.seeds)}{rate}"
+
+
+def _with_seeds(estimate: Estimate, seeds: Sequence[int]) -> str:
+    return f"{format_interval(estimate)}, {counted(len(seeds), 'seed')}"

@@ -18,12 +18,13 @@ from ..views.sections import Section, Table, short
 LOST = 0.5
 """Share of its validation episodes below which a skill counts as lost."""
 
-NOTES = (
+NOTE = (
     "Here, a skill counts as lost if the policy succeeds in fewer than half of its validation episodes after "
-    "the last target. Each run measures only the skill with the fewest successes.",
-    "The steps are those on the skill's demonstrations until the policy meets the criterion again; without "
-    "it, they are the full budget of a stage. A policy without pretraining has learned the targets.",
+    "the last target. Each run measures only the skill with the fewest successes. If the policy never meets "
+    "the criterion again, the full budget of a stage counts."
 )
+
+UNPRETRAINED = "The last column is for a policy that was not pretrained, and learned only the targets."
 
 
 def lost_skills_section(boards: Mapping[str, Sequence[Row]]) -> Section:
@@ -34,14 +35,26 @@ def lost_skills_section(boards: Mapping[str, Sequence[Row]]) -> Section:
         measured = _measured(by_method.get(BASELINE))
         if measured:
             lost = [found for found, share in measured if share < LOST]
-            losses.append(f"{len(lost)} of {counted(len(measured), 'seed')} on {short(name)}")
+            losses.append(
+                f"On {short(name)}, plain fine-tuning loses a skill in {len(lost)} of "
+                f"{counted(len(measured), 'seed')}{_return_of(lost)}."
+            )
             lines.append((short(name), *_cells(lost, by_method.get(FROM_SCRATCH))))
     question = "Is a lost skill gone for good?"
     if not lines:
         return Section(question, ())
-    head = ("scenario", "lost skills", "steps to relearn", "never relearned", "steps without pretraining")
-    answer = f"Plain fine-tuning loses a skill in {', '.join(losses)}."
-    return Section(question, (answer,), (Table(head, tuple(lines)),), NOTES)
+    head = ("scenario", "lost skills, seeds", "steps to relearn", "never relearned")
+    if all(line[-1] == MISSING for line in lines):
+        return Section(question, tuple(losses), (Table(head, tuple(line[:-1] for line in lines)),), (NOTE,))
+    table = Table((*head, "steps without pretraining"), tuple(lines))
+    return Section(question, tuple(losses), (table,), (NOTE, UNPRETRAINED))
+
+
+def _return_of(lost: Sequence[Relearning]) -> str:
+    """Return the end of a sentence on how fast lost skills come back; empty for a single run."""
+    if len(lost) < 2:
+        return ""
+    return f", and meets the criterion again after {_steps(lost)} steps on the skill's demonstrations"
 
 
 def _cells(lost: Sequence[Relearning], unpretrained: Row | None) -> tuple[str, str, str, str]:
