@@ -125,7 +125,8 @@ def test_a_run_that_another_process_took_over_writes_nothing_more(
     monkeypatch.setattr(leases, "SECONDS", 0.3)
     spec = RunSpec(TINY.id, stranger(_Waits), seed=0)
     with pytest.raises(
-        LeaseLostError, match=r"This process did not answer for \d+ s and lost .* to another process"
+        LeaseLostError,
+        match=r"This process lost .*: it did not answer for \d+ s and another process took over",
     ):
         execute(spec, tmp_path / "records")
     assert not (tmp_path / "records").exists()
@@ -146,7 +147,8 @@ def test_a_run_that_another_process_took_over_before_it_began_leaves_the_stages_
     tmp_path: Path, empty_caches: Path, stranger: Callable[[type[Method]], str]
 ) -> None:
     with pytest.raises(
-        LeaseLostError, match=r"This process did not answer for \d+ s and lost .* to another process"
+        LeaseLostError,
+        match=r"This process lost .*: it did not answer for \d+ s and another process took over",
     ):
         execute(RunSpec(TINY.id, stranger(_StartsLate), seed=0), tmp_path)
     assert [path.name for path in cache_folder().glob("runs/*/stage-*")] == ["stage-1"]
