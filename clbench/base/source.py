@@ -15,14 +15,13 @@ import errno
 import functools
 import hashlib
 import importlib.util
-import inspect
 import os
 import re
 import stat
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from types import CodeType
+from types import CodeType, FunctionType
 
 DATA_SOURCES = ("clbench.base", "clbench.spec", "clbench.policy", "clbench.worlds", "clbench.data")
 """Code that demonstrations and questions depend on, besides the suite of their tasks."""
@@ -226,20 +225,21 @@ def class_hash(cls: type) -> str:
     """
     digest = hashlib.sha256()
     for name, value in sorted(vars(cls).items()):
-        code = getattr(_undecorated(value), "__code__", None)
-        if code is not None:
-            digest.update(f"{name} {_code_text(code)}".encode())
+        codes = [one.__code__ for one in _functions_of(value)]
+        if codes:
+            digest.update(f"{name} {' '.join(map(_code_text, codes))}".encode())
         elif not name.startswith("__") and isinstance(value, str | int | float | tuple | None):
             digest.update(f"{name} {value!r}".encode())
     return digest.hexdigest()[:16]
 
 
-def _undecorated(value: object) -> object:
-    """Return the function of a class method, a property or a cached one, without its decorators."""
-    function = next(
-        (getattr(value, name) for name in ("__func__", "fget", "func") if hasattr(value, name)), value
-    )
-    return inspect.unwrap(function) if callable(function) else function
+def _functions_of(value: object) -> Iterator[FunctionType]:
+    """Yield the function of a method or a property, from its outermost decorator to what is decorated."""
+    names = ("__func__", "fget", "func")
+    found = next((getattr(value, name) for name in names if hasattr(value, name)), value)
+    while isinstance(found, FunctionType):
+        yield found
+        found = getattr(found, "__wrapped__", None)
 
 
 def _code_text(code: CodeType) -> str:

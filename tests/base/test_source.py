@@ -335,7 +335,7 @@ class Some:
     def size(self):
         return {size}
 
-    @torch.no_grad()
+    @{decorator}
     def end(self):
         return {end}
 
@@ -351,16 +351,23 @@ def test_the_hash_of_a_typed_class_follows_its_code_and_values_and_not_its_place
         exec(text, space)
         return class_hash(space["Some"])
 
-    usual = {"number": 1, "name": "three", "size": 4, "end": 6, "limit": 8}
+    usual = {"number": 1, "name": "three", "size": 4, "end": 6, "limit": 8, "decorator": "torch.no_grad()"}
     before = hashed(CLASS.format(**usual))
     assert hashed("# a remark\n\n" + CLASS.format(**usual)) == before
-    for change in ({"number": 2}, {"name": "four"}, {"size": 5}, {"end": 7}, {"limit": 9}):
+    for change in (
+        {"number": 2},
+        {"name": "four"},
+        {"size": 5},
+        {"end": 7},
+        {"limit": 9},
+        {"decorator": "staticmethod"},
+    ):
         assert hashed(CLASS.format(**usual | change)) != before
 
 
 @pytest.mark.long
 def test_the_hash_of_a_typed_class_is_the_same_in_every_process() -> None:
-    text = CLASS.format(number=1, name="three", size=4, end=6, limit=8)
+    text = CLASS.format(number=1, name="three", size=4, end=6, limit=8, decorator="torch.no_grad()")
     imports = "import functools, torch\nfrom clbench.base.source import class_hash\n"
     code = f"{imports}{text}\nprint(class_hash(Some))"
     command = [sys.executable, "-c", code]
