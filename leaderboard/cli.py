@@ -141,8 +141,8 @@ def _why_empty(board: Summary, shown: Summary, scenario: str | None, records: Pa
     scenario = without_module(scenario)
     if not shown.not_shown and scenario not in scenario_ids():
         return str(unknown("scenario with records", scenario, board.starts).args[0])
-    # `clbench run` skips runs that have a record
-    advice = "" if shown.not_shown else f": `clbench run {scenario} sft` makes some"
+    skips = ", unless its records are whole" if shown.not_shown else ""
+    advice = f": `clbench run {scenario} sft` makes some{skips}"
     names = ", ".join(sorted(board.starts))
     return f"No record in {records} makes a row of {scenario}{advice}. Scenarios with rows: {names}."
 

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from rich.console import Console
 
-from clbench.base.cache import hash_of, hash_of_tensors
+from clbench.base.cache import hash_of
 from clbench.base.errors import InputError
-from clbench.base.text import megabytes
+from clbench.base.text import listed, megabytes
 from clbench.cli.arguments import (
     MethodName,
     PolicyName,
@@ -149,20 +149,44 @@ def _policies(
     """Return the policies by the captions of their columns; equal policies before any target share one."""
     from clbench.runs.film import column_of
     from clbench.runs.stages import load_stages
-    from clbench.runs.start import starts_as_pretrained
 
+    folders = _stages_folders(runs, checkpoints, console)
+    stages = [load_stages(run, folder) for run, folder in zip(runs, folders, strict=True)]
+    starts = _starts(runs, [one[0] for one in stages])
     columns: dict[str, Policy] = {}
-    shared = None
-    for run, folder in zip(runs, _stages_folders(runs, checkpoints, console), strict=True):
-        stages = load_stages(run, folder)
-        # beside its weights, `prepare` of a stranger's method may change what a policy computes
-        start = hash_of_tensors(stages[0].state_dict()) if starts_as_pretrained(run) else run.label
-        shared = shared or start
+    for run, policies, start in zip(runs, stages, starts, strict=True):
         for number in numbers:
             caption = column_of(run, number, alone=len(runs) == 1)
-            own = not number and start != shared
-            columns.setdefault(f"{run.label}, {caption}" if own else caption, stages[number])
+            columns.setdefault(caption if number else f"{start}{caption}", policies[number])
     return columns
+
+
+def _starts(runs: Sequence[ResolvedRun], policies: Sequence[Policy]) -> list[str]:
+    """Return the beginning of each run's caption before any target: the methods that start from its policy.
+
+    It is empty if all do. Tensors that a method adds, such as adapters that are still 0, do not count.
+    """
+    from clbench.runs.start import starts_as_pretrained
+
+    groups: list[list[int]] = []
+    for index, (run, policy) in enumerate(zip(runs, policies, strict=True)):
+        # beside its weights, `prepare` of a stranger's method may change what a policy computes
+        own = not starts_as_pretrained(run)
+        like = [
+            one for one in groups if starts_as_pretrained(runs[one[0]]) and _alike(policies[one[0]], policy)
+        ]
+        if own or not like:
+            groups.append([index])
+        else:
+            like[0].append(index)
+    names = {index: listed(runs[one].label for one in group) for group in groups for index in group}
+    return ["" if len(groups) == 1 else f"{names[index]}, " for index in range(len(runs))]
+
+
+def _alike(policy: Policy, other: Policy) -> bool:
+    """Return whether two policies have the same values in the tensors that both have."""
+    weights = other.state_dict()
+    return all(value.equal(weights[name]) for name, value in policy.state_dict().items() if name in weights)
 
 
 def _stages(text: str | None, last: int) -> list[int]:

@@ -334,7 +334,8 @@ class _ChunkPlayer:
             fits, wanted = length >= 1, "any number of actions"
         elif self.whole:
             fits = length == known
-            wanted = f"{known} actions as before; executed={known} executes the first {known} of more"
+            option = f"executed={known} (--executed {known} of `clbench score`)"
+            wanted = f"{known} actions as before; {option} executes the first {known} of more"
         else:
             fits, wanted = length >= known, f"at least {known} actions"
         if not fits:

@@ -147,7 +147,7 @@ def check_copy(policy: Policy, batch: Batch) -> None:
         raise ContractError("sound hooks", expected, found, "prepare() and load_state()") from error
     before = actions_of(twin, batch)
     with _shifted(policy):
-        follows = not torch.equal(before, actions_of(twin, batch))
+        follows = moved(before, actions_of(twin, batch))
     if follows:
         expected = (
             "a deep copy of the policy to act with its own weights: functions that are added to the policy "
@@ -168,7 +168,7 @@ def check_step_factor(first: Mapping[str, Tensor], slower: Mapping[str, Tensor],
     Raises:
         ContractError: All weights are equal.
     """
-    if all(same(value, slower[name]) for name, value in first.items()):
+    if first.keys() == slower.keys() and all(same(value, slower[name]) for name, value in first.items()):
         expected = (
             "other weights with a smaller step_factor, which tuning tries for every method: multiply the "
             "learning rate of your own steps by self.step_factor, or take the one that learning_rate() gets"

@@ -196,7 +196,8 @@ class ToyRun:
     def weights(self, number: int) -> dict[str, Tensor]:
         """Return all tensors of the policy after stage `number`."""
         stage = f"stage {number} ({self.trainer.scenario.target[number - 1].name})"
-        return {name: self.outcomes[stage, name] for name in self.trainer.policy.state_dict()}
+        names = self.trainer.policy.state_dict()
+        return {name: value for (one, name), value in self.outcomes.items() if one == stage and name in names}
 
     def hooks_that_draw(self, source: str) -> set[str]:
         """Return the hooks that draw samples from a source."""

@@ -88,7 +88,7 @@ def half_way(runs: Runs, finished: Path, tmp_path_factory: pytest.TempPathFactor
     count, _ = runs.do(folder)
     shutil.rmtree(folder / "records")
     assert count is not None
-    assert runs.do(folder, at=round(0.8 * count), fault=fault_server.DIES) == (None, "killed")
+    assert runs.do(folder, at=round(0.7 * count), fault=fault_server.DIES) == (None, "killed")
     assert len(list(folder.glob("cache/runs/*/stage-*"))) >= 2
     return folder
 

@@ -257,12 +257,14 @@ def test_a_method_that_changes_the_policy_before_the_first_target_has_a_column_o
         policies = load_stages(SPEC.resolve(), folder)
         if run.label == "fast_dvla":
             torch.nn.init.zeros_(next(policies[0].parameters()))
+        if run.label == "l2_sp":
+            policies[0].register_buffer("added", torch.zeros(1))
         return policies
 
     monkeypatch.setattr("clbench.runs.stages.find_stages", lambda *_: kept)
     monkeypatch.setattr("clbench.runs.stages.load_stages", load)
     film(TOY, "sft", "l2_sp", "fast_dvla", tasks="left", size=240, output=tmp_path / "toy.gif")
-    shared, own = "before any target", "fast_dvla, before any target"
+    shared, own = "sft and l2_sp, before any target", "fast_dvla, before any target"
     assert written[2:7] == [shared, "after sft", "after l2_sp", own, "after fast_dvla"]
 
 
