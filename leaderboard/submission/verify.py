@@ -32,7 +32,7 @@ from clbench.policy.checkpoint import save_policy
 from clbench.records.fingerprints import LATER, other_parts, other_versions
 from clbench.records.reader import RecordError, UnreadableRecordError
 from clbench.records.record import Record, RunInfo, ScenarioInfo
-from clbench.runs.length import run_length
+from clbench.runs.length import run_length, watching_length
 from clbench.runs.run import execute, pretrained_hash
 from clbench.runs.spec import describe_scenario
 from clbench.scoring.metrics import measure
@@ -395,6 +395,7 @@ def _job(path: Path, records: Path, request: Request, report: Path) -> Job:
             length += len(scenario.target) * scenario.budget.adaptation_steps
         if request.tier == "retrained":
             length += run_length(scenario, subject.protocol)
+            length += 0.0 if subject.strange else watching_length(subject.resolved.method, scenario)
             length += scenario.budget.pretraining_steps * request.pretrain
     except ClbenchError:
         pass  # the job itself reports the error
