@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from ..board.frontier import Curve
 from ..board.rows import Row
@@ -42,13 +42,7 @@ def _panel(name: str, rows: Sequence[Row]) -> Spec:
         for row in rows
     ]
     divisions = [division for division in DIVISIONS if any(row.division == division for row in rows)]
-    method = {
-        "field": "method",
-        "type": "nominal",
-        "sort": [row.method for row in rows],
-        "title": None,
-        "axis": {"labelColor": colour("ink")},
-    }
+    method = _names(row.method for row in rows)
     hue = {
         "field": "division",
         "type": "nominal",
@@ -89,13 +83,7 @@ def _rates(name: str, curves: Sequence[Curve]) -> Spec:
     ]
     factors = sorted({one.factor for curve in curves for one in curve.rungs}, reverse=True)
     rates = [f"{factor:g}" for factor in factors]
-    method = {
-        "field": "method",
-        "type": "nominal",
-        "sort": [curve.method for curve in curves],
-        "title": None,
-        "axis": {"labelColor": colour("ink")},
-    }
+    method = _names(curve.method for curve in curves)
     scale = {"domain": rates, "range": [colour(f"mark-{place % 6}") for place in range(len(rates))]}
     marks = {"domain": rates, "range": [SHAPES[place % 6] for place in range(len(rates))]}
     legend = {"title": "learning rate, times the scenario's", "titleColor": colour("ink")}
@@ -112,3 +100,9 @@ def _rates(name: str, curves: Sequence[Curve]) -> Spec:
             "shape": {"field": "rate", "type": "nominal", "legend": legend, "scale": marks},
         },
     }
+
+
+def _names(methods: Iterable[str]) -> Spec:
+    """Return the encoding of the methods, each on a line of its own."""
+    look = {"title": None, "axis": {"labelColor": colour("ink")}}
+    return {"field": "method", "type": "nominal", "sort": list(methods), **look}

@@ -229,16 +229,22 @@ def test_a_program_that_was_refused_a_stage_does_not_keep_the_run(
     subprocess.run([sys.executable, "-c", BEGINS.format(id=ID)], cwd=empty_caches, check=True)
 
 
-def test_a_stage_of_a_process_that_lost_its_lease_is_not_kept(
-    evaluate: Callable[..., Any], tmp_path: Path
-) -> None:
-    def act(observation: object) -> list[int]:
-        for lease in (tmp_path / "records").rglob(".*.lease"):
+def losing(folder: Path) -> Callable[[object], list[int]]:
+    """Return an agent that removes the leases below a folder whenever it acts."""
+
+    def act(_: object) -> list[int]:
+        for lease in folder.rglob(".*.lease"):
             lease.unlink()
         return [0, 0]
 
+    return act
+
+
+def test_a_stage_of_a_process_that_lost_its_lease_is_not_kept(
+    evaluate: Callable[..., Any], tmp_path: Path
+) -> None:
     with pytest.raises(LeaseLostError):
-        evaluate(act, stage_env(0))
+        evaluate(losing(tmp_path / "records"), stage_env(0))
     assert not list((tmp_path / "records").rglob("*.unfinished"))
 
 
@@ -254,12 +260,7 @@ def test_a_run_whose_lease_was_lost_can_be_taken_again(evaluate: Callable[..., A
 def test_a_stage_that_was_not_kept_can_be_evaluated_again(
     evaluate: Callable[..., Any], tmp_path: Path
 ) -> None:
-    def act(observation: object) -> list[int]:
-        for lease in (tmp_path / "records").rglob(".*.lease"):
-            lease.unlink()
-        return [0, 0]
-
     evaluate(Knowing(), stage_env(0))
     with pytest.raises(LeaseLostError):
-        evaluate(act, stage_env(1))
+        evaluate(losing(tmp_path / "records"), stage_env(1))
     assert set(evaluate(Knowing(), stage_env(1)).episodes["stage"]) == {0, 1}
