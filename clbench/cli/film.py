@@ -169,16 +169,14 @@ def _starts(runs: Sequence[ResolvedRun], policies: Sequence[Policy]) -> list[str
     from clbench.runs.start import starts_as_pretrained
 
     groups: list[list[int]] = []
-    for index, (run, policy) in enumerate(zip(runs, policies, strict=True)):
-        # beside its weights, `prepare` of a stranger's method may change what a policy computes
-        own = not starts_as_pretrained(run)
-        like = [
-            one for one in groups if starts_as_pretrained(runs[one[0]]) and _alike(policies[one[0]], policy)
-        ]
-        if own or not like:
-            groups.append([index])
-        else:
+    # beside its weights, `prepare` of a stranger's method may change what a policy computes
+    known = [starts_as_pretrained(run) for run in runs]
+    for index, policy in enumerate(policies):
+        like = [one for one in groups if known[index] and known[one[0]] and _alike(policies[one[0]], policy)]
+        if like:
             like[0].append(index)
+        else:
+            groups.append([index])
     names = {index: listed(runs[one].label for one in group) for group in groups for index in group}
     return ["" if len(groups) == 1 else f"{names[index]}, " for index in range(len(runs))]
 

@@ -134,14 +134,18 @@ PREDICTED = (
 BY_CONSTRUCTION = "`stop_gradient` does not train the backbone, so by construction few of its weights change."
 
 
-def predictors_section(boards: Mapping[str, list[Row]]) -> Section:
-    """Return what orders the methods as their forgetting does."""
+def predictors_section(board: Board, boards: Mapping[str, list[Row]]) -> Section:
+    """Return what orders the methods as their forgetting does.
+
+    Args:
+        board: The board of the records.
+        boards: Rows of each scenario at a common criterion.
+    """
     by_place: dict[tuple[str, str], list[RankCorrelation | None]] = {}
     for name, rows in boards.items():
-        every, rest = (
-            {one.predictor: one for one in predictions(them)} for them in (rows, without_demonstrations(rows))
-        )
-        by_place |= {(short(name), predictor): [every[predictor], rest.get(predictor)] for predictor in every}
+        rest = {one.predictor: one for one in predictions(without_demonstrations(rows))}
+        for one in board.predictions.get(name, ()):
+            by_place[short(name), one.predictor] = [one, rest.get(one.predictor)]
     question = "What predicts how much a method forgets?"
     if not by_place:
         return Section(question, ())

@@ -66,7 +66,7 @@ def sections(board: Board, judged: Sequence[Judged], evidence: Callable[[str], E
         lost_skills_section(boards),
         claims_section(judged),
         orders_section(board, boards),
-        predictors_section(boards),
+        predictors_section(board, boards),
         _knowledge(_usual(board)),
         _policies(board),
     )

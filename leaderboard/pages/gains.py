@@ -45,18 +45,20 @@ def gains_section(boards: Mapping[str, Sequence[Row]], tied: Tied) -> Section:
     """
     judged = {name: rows for name, rows in boards.items() if _without_demonstrations(rows)}
     answers, undistinguished = [], []
+    lines = []
     for name, rows in judged.items():
-        found = list(_certain_gains(name, rows, tied.get(name, {})))
+        sides = sides_of_gains(rows, tied.get(name, {}))
+        found = list(_told_above(name, rows, tied.get(name, {}), sides))
         answers += found
         undistinguished += [] if found else [short(name)]
+        lines.append(_gain_line(name, rows, tied.get(name, {}), sides))
     if undistinguished:
         where = listed(undistinguished)
         answers.insert(0, f"On {where}, no method is above plain fine-tuning and told apart from it.")
     for name in judged:
         answers += _over_tied_settings(name, tied.get(name, {}))
     head = ("scenario", "compared", "largest gain", "a gain must exceed", "told apart")
-    lines = tuple(_gain_line(name, rows, tied.get(name, {})) for name, rows in judged.items())
-    tables = (Table((*head, "interval excludes 0, not told apart"), lines),) if lines else ()
+    tables = (Table((*head, "interval excludes 0, not told apart"), tuple(lines)),) if lines else ()
     question = "Does a method without prior demonstrations beat tuned fine-tuning?"
     picture = "gains" if any(by_gain(rows) for rows in boards.values()) else ""
     return Section(question, tuple(answers), tables, (FAMILY,) if lines else (), picture)
@@ -68,13 +70,13 @@ def _without_demonstrations(rows: Sequence[Row]) -> list[Row]:
     return [row for row in by_gain(rows) if has_baseline and row.division in WITHOUT_DEMONSTRATIONS]
 
 
-def _certain_gains(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]]) -> Iterator[str]:
-    """Yield the gains that are told apart from 0: first those that are certain, then the others."""
+def _told_above(
+    name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]], sides: Mapping[str, int]
+) -> Iterator[str]:
+    """Yield the gains above 0 that are told apart from it: first those that are certain, then the others."""
     gains = {row.method: row.estimates["gain"] for row in _without_demonstrations(rows)}
-    sides = sides_of_gains(rows, tied)
-    better = [row.method for row in rows if row.method in gains and row.method in sides]
-    better = [method for method in better if (gains[method].value or 0.0) > 0]
-    certain = [method for method in better if sides.get(method) == 1]
+    better = [method for method, gain in gains.items() if method in sides and (gain.value or 0.0) > 0]
+    certain = [method for method in better if sides[method] == 1]
     if certain:
         named = ", ".join(f"`{method}` by {format_interval(gains[method], '.3f')}" for method in certain)
         yield f"On {short(name)}, yes: {named}."
@@ -84,12 +86,11 @@ def _certain_gains(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[T
 
 
 def _gain_line(
-    name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]]
+    name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]], apart: Collection[str]
 ) -> tuple[str, str, str, str, str, str]:
-    """Return the cells of a scenario."""
+    """Return the cells of a scenario; `apart` are the methods that are told apart from plain fine-tuning."""
     others = _without_demonstrations(rows)
     gains = {row.method: row.estimates["gain"] for row in others}
-    apart = sides_of_gains(rows, tied)
     cells = {row.method: _gain_cell(row, tied.get(row.method, ())) for row in others}
     told = [cells[method] for method in gains if method in apart]
     alone = [
