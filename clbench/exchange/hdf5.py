@@ -126,10 +126,11 @@ def read_hdf5(path: Path, task: Task, state: Sequence[str] = ("states",)) -> lis
             f"{list(state)}."
         )
     _check_readable(path)
+    rate = control_rate(task)  # here: an error of the world is not one of the file
     with closing(resolve(task.world)()) as world:
         try:
             with h5py.File(path, "r") as file:
-                return _File(path, file, task, world, state).demonstrations()
+                return _File(path, file, task, world, rate, state).demonstrations()
         except InputError:  # a ValueError, too
             raise
         except _DAMAGE as error:
@@ -162,8 +163,10 @@ def _is_own_group(data: h5py.Group, name: str) -> bool:
 class _File:
     """An HDF5 file that is read for a task."""
 
-    def __init__(self, path: Path, file: h5py.File, task: Task, world: World, state: Sequence[str]) -> None:
-        self._path, self._file, self._task, self._names = path, file, task, tuple(state)
+    def __init__(
+        self, path: Path, file: h5py.File, task: Task, world: World, rate: float | None, state: Sequence[str]
+    ) -> None:
+        self._path, self._file, self._task, self._rate, self._names = path, file, task, rate, tuple(state)
         self._states, self._actions = world.observation_space, world.action_space
         self._convert = getattr(getattr(world, "vector_world", None), "recorded_states", None)
 
@@ -212,7 +215,7 @@ class _File:
         rate = kwargs.get("control_freq") if isinstance(kwargs, dict) else None
         if not isinstance(rate, int | float):
             return
-        own = control_rate(self._task)
+        own = self._rate
         if own is not None and not abs(rate - own) <= FARTHEST_RATE * own:  # also if it is NaN
             raise self._error(
                 f"it was recorded at {rate:g} steps per second, but the world {self._task.world} makes "

@@ -312,6 +312,21 @@ def test_a_file_must_have_the_rate_of_its_task_in_the_world(
         read_hdf5(exported, task)
 
 
+class _Broken(toy_module.ToyWorld):
+    """A toy that cannot be reset."""
+
+    def reset(self, **arguments: Any) -> Any:
+        raise ValueError("the scene has no table")
+
+
+def test_an_error_of_the_world_is_not_one_of_the_file(
+    exported: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(toy_module, "Broken", _Broken, raising=False)
+    with pytest.raises(ValueError, match="^the scene has no table$"):
+        read_hdf5(exported, dataclasses.replace(TASK, world="clbench.testing.toy:Broken"))
+
+
 def test_an_instruction_counts_as_a_policy_reads_it(exported: Path) -> None:
     with h5py.File(exported, "r+") as file:
         _attribute("problem_info", '{"language_instruction": "Go right!"}')(file["data"])
