@@ -10,7 +10,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from clbench.base.text import counted
+from clbench.runs.tuning import tuned, tuned_scenarios
 from clbench.scoring.reading import is_number
+from clbench.spec.registry import load_scenario
 
 from .claim import (
     ANYWHERE,
@@ -50,6 +52,7 @@ WITH_A_LADDER = BOARDS[:2]
 """The boards on whose ladders every method has run at every learning rate."""
 
 NOTHING_TO_KEEP = "sft does not certainly lose 0.01 of the answers: there is nothing to keep."
+CHOSEN = "Length and learning rate of this scenario were chosen so that sft loses answers (A1), and "
 LOSES_ANSWERS = "A longer or narrower fine-tuning, after which sft has certainly lost answers."
 
 
@@ -79,7 +82,7 @@ def action_loss_erodes_answers(evidence: Evidence) -> Finding:
         sentences.append("Without this gradient in the backbone, less is lost, so the gradient is the cause.")
     verdict = decided(
         holds=any(figure.low > 0.01 for figure in half),
-        in_part=drop.low > 0.01,
+        in_part=bool(half) and drop.low > 0.01,  # else nobody looked in the first half
         fails=drop.high < 0.01,
     )
     return Finding(
@@ -190,11 +193,33 @@ def lora_still_overwrites(evidence: Evidence) -> Finding:
         (
             *([f"{', '.join(less)}: fewer answers are lost than with sft."] if less else ()),
             "The direction of the update was not measured.",
-            "lora was not tuned here: its learning rate is 3 to 111 times those that tuning chose elsewhere.",
+            *(f"{one}." for one in _not_tuned(evidence, "lora")),
             *_when_lost(evidence, "lora"),
         ),
         what_would_change(*_deciding_rank(answers, skills)),
     )
+
+
+def _not_tuned(evidence: Evidence, method: str) -> list[str]:
+    """Return how the learning rate of a method that was not tuned compares with those of its tuned settings.
+
+    Empty if it was tuned on the scenario or on no other, or has no run.
+    """
+    run = evidence.first_run(method)
+    elsewhere = [
+        load_scenario(name).budget.learning_rate * found.settings["step_factor"]
+        for name in tuned_scenarios()
+        if (found := tuned(name).get(method))
+    ]
+    of_scenario: Any = run.record.scenario.budget.get("learning_rate") if run else None
+    if run is None or not is_number(of_scenario) or not elsewhere or method in tuned(evidence.scenario):
+        return []
+    factor: Any = run.record.run.settings.get("step_factor", SCENARIO_RATE)
+    rate = of_scenario * factor
+    return [
+        f"{method} was not tuned here: its learning rate is {rate / max(elsewhere):.0f} to "
+        f"{rate / min(elsewhere):.0f} times those that tuning chose elsewhere"
+    ]
 
 
 def _deciding_rank(answers: Sequence[Figure], skills: Sequence[Figure]) -> tuple[Figure, float]:
@@ -231,14 +256,16 @@ def keeps_answers(evidence: Evidence) -> Finding:
     of_sft = question_drop(evidence, "sft")
     if loses_no_answers(of_sft):
         return Finding("cannot be shown here", (aegis,), (sft, *gains), (NOTHING_TO_KEEP,), LOSES_ANSWERS)
+    chosen = CHOSEN if evidence.scenario in KNOWLEDGE else ""
     return Finding(
         "undecided" if of_sft.is_unknown else decided(holds=aegis.low >= -0.01, fails=aegis.high < -0.01),
         (aegis,),
         (sft, *gains, *answer_curve(evidence, "aegis")),
         (
-            "Length and learning rate of this scenario were chosen so that sft loses answers (A1), and aegis "
-            "was not tuned here: its learning rate is 61 to 202 times those that tuning chose elsewhere. It "
-            "may keep answers at smaller rates.",
+            *(
+                f"{chosen}{one}. It may keep answers at smaller rates."
+                for one in _not_tuned(evidence, "aegis")
+            ),
             *_when_lost(evidence, "aegis"),
             *_near_the_anchor(anchor_ratio(evidence)),
             not_told_apart(

@@ -65,8 +65,10 @@ def what_the_full_rate_says(gain: Figure, controls: Sequence[Figure]) -> list[st
 
 def what_controls_say(gain: Figure, figures: Sequence[Figure], arms: Sequence[str]) -> list[str]:
     """Return what the controls of the arms that count say about a gain over sft, if there is one."""
+    method, other = gain.methods[:2]
+    if gain.is_unknown:
+        return [f"The records cannot show whether {method} keeps more than {other}."]
     if gain.low <= 0:
-        method, other = gain.methods[:2]
         return [f"{method} does not certainly keep more than {other}: there is no gain to explain."]
     says = [(one, *CONTROLS[one.methods[1]]) for one in figures if one.methods[0] in arms]
     return [not_told_apart(figure, explains=yes, does_not=no) for figure, yes, no in says]

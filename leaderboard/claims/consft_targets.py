@@ -93,6 +93,13 @@ def _gains_in_transfer(evidence: Evidence, arm: str) -> Iterator[Figure]:
 def _what_keeps_targets(over_sft: Figure, over_controls: Sequence[Figure]) -> str:
     """Return what sft and the controls say about an arm's gain in backward transfer."""
     reaching = [one.methods[1] for one in over_controls if one.low <= 0]
+    compared = {one.methods[1] for one in over_controls if not one.is_unknown}
+    missing = [label for label in CONTROLS if label not in compared]
+    if over_sft.low > 0 and missing and not reaching:
+        return (
+            "sft at its best learning rate certainly keeps fewer; whether weighing samples is the cause is "
+            f"not known without runs of {listed(missing)}."
+        )
     if over_sft.low > 0 and reaching:
         do = "does" if len(reaching) == 1 else "do"
         return (

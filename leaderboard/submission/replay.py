@@ -211,10 +211,13 @@ def _go_on(subject: Subject, kept: Path, policies: Sequence[Policy]) -> Check:
 
 
 def _distance(one: Policy, other: Policy) -> float:
-    """Return the distance between the weights and buffers that two policies have in common."""
+    """Return the distance between the weights and buffers that two policies have in common.
+
+    In 32 bits, a weight of 1e20 would make every distance infinite, and infinities pass every comparison.
+    """
     values = one.state_dict()
     common = [(values[name], value) for name, value in other.state_dict().items() if name in values]
-    return math.hypot(*(float((value.float() - same.float()).norm()) for same, value in common))
+    return math.hypot(*(float((value.double() - same.double()).norm()) for same, value in common))
 
 
 def _outcome(row: EpisodeRow) -> str:

@@ -324,16 +324,17 @@ def test_plain_fine_tuning_that_is_tuned_to_small_steps_is_its_own_control(
     assert judged("C4", given, {"sft": {0: run}}).verdict == "cannot be shown here"
 
 
-@pytest.mark.parametrize(("half", "verdict"), [(True, "holds"), (False, "holds in part")])
-def test_a_loss_after_half_of_the_stage_is_not_rapid(
-    half: bool, verdict: str, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("steps", "verdict"),
+    [((10, 50, 100), "holds"), ((10, 60, 100), "holds in part"), ((60, 100), "undecided")],
+)
+def test_a_loss_after_half_of_the_stage_is_not_rapid_if_somebody_looked_before(
+    steps: tuple[int, ...], verdict: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    point = Figure("a point", ("sft",), Estimate(0.1, 0.05, 0.2), (0, 1))
-    steps = (50, 100) if half else (60, 100)
-    monkeypatch.setattr(
-        f"{MODULE}.aegis.answer_curve", lambda _, method: [point, point][: 2 * (method == "sft")]
-    )
-    monkeypatch.setattr(f"{MODULE}.aegis.learning_curve", lambda *_: (steps, [0.5, 0.6]))
+    kept, lost = (Figure("a point", ("sft",), Estimate(0.1, low, 0.2), (0, 1)) for low in (0.0, 0.05))
+    points = [kept, lost, lost][-len(steps) :]
+    monkeypatch.setattr(f"{MODULE}.aegis.answer_curve", lambda _, method: points if method == "sft" else [])
+    monkeypatch.setattr(f"{MODULE}.aegis.learning_curve", lambda *_: (steps, [0.5] * len(steps)))
     assert judged("A1", {ANSWERS.format("sft"): (0.05, 0.2)}).verdict == verdict
 
 
@@ -343,7 +344,6 @@ def test_only_a_method_that_certainly_keeps_more_answers_than_plain_fine_tuning_
     assert judged("A3", given).sentences == (
         "lora+rank=4: fewer answers are lost than with sft.",
         "The direction of the update was not measured.",
-        "lora was not tuned here: its learning rate is 3 to 111 times those that tuning chose elsewhere.",
     )
 
 

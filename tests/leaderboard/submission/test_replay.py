@@ -279,19 +279,22 @@ def test_the_stage_that_is_trained_again_is_drawn_with_the_seed_of_the_verifier(
     assert stages == {"1", "2"}
 
 
+# the square of 1e20 is beyond 32 bits: it must not make every distance infinite
+@pytest.mark.parametrize("huge", [0.0, 1e20])
 def test_a_policy_that_is_off_by_a_tenth_of_its_way_is_refused(
-    mine: Path, honest: Path, tmp_path: Path
+    huge: float, mine: Path, honest: Path, tmp_path: Path
 ) -> None:
     for stage in (honest / "checkpoints").rglob("stage-*"):
         inputs = json.loads((stage / MANIFEST).read_text(encoding="utf-8"))["made_from"]
 
         def write(folder: Path, stage: Path = stage) -> None:
             shutil.copytree(stage, folder, dirs_exist_ok=True)
+            weights = load_file(stage / "policy.safetensors")
             if stage.name == "stage-2":
-                names = ("stage-1", "stage-2")
-                before, after = (load_file(stage.with_name(one) / "policy.safetensors") for one in names)
-                off = {name: value + 0.1 * (value - before[name]) for name, value in after.items()}
-                save_file(off, folder / "policy.safetensors")
+                before = load_file(stage.with_name("stage-1") / "policy.safetensors")
+                weights = {name: value + 0.1 * (value - before[name]) for name, value in weights.items()}
+            weights["backbone.words.weight"][-1] += huge * int(stage.name[-1])  # no text of the toy uses it
+            save_file(weights, folder / "policy.safetensors")
 
         place = tmp_path / "off" / stage.relative_to(honest)
         place.parent.mkdir(parents=True, exist_ok=True)
