@@ -142,7 +142,7 @@ def work_of(entry: Entry, batch: Batch) -> list[Work]:
 
 
 def by_width(spans: list[tuple[int, int]], rounds: int, generator: np.random.Generator) -> dict[str, Any]:
-    """Return times of the head as ratios, by width of the policy.
+    """Return times of the head with blocks of one step as ratios, by width of the policy.
 
     `chunk`: the time of easy-first decoding divided by that of the given forwards with kept keys. `forward`:
     the time of a forward of all tokens divided by that of a forward of one block.
