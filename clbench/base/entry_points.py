@@ -58,6 +58,8 @@ def import_module(module: str, needed_for: str) -> Any:
     except ClbenchError:
         raise
     except ModuleNotFoundError as error:
+        if error.name is None:  # raised by hand, with a text of its own
+            raise InputError(_cannot_import(module, needed_for, error)) from error
         if not hint and error.name == module.partition(".")[0]:  # else a module that it imports is missing
             hint = _hint_of_folder(error.name)
         raise UnknownNameError(
@@ -66,8 +68,12 @@ def import_module(module: str, needed_for: str) -> Any:
     except (Exception, SystemExit) as error:  # a script without `if __name__ == "__main__"` may exit
         if module.partition(".")[0] == "clbench":  # a bug of ours shows its traceback
             raise
-        what = f"{type(error).__name__}: {error}"
-        raise InputError(f"The module {module!r} cannot be imported for {needed_for!r}: {what}") from error
+        raise InputError(_cannot_import(module, needed_for, error)) from error
+
+
+def _cannot_import(module: str, needed_for: str, error: BaseException) -> str:
+    what = f"{type(error).__name__}: {error}"
+    return f"The module {module!r} cannot be imported for {needed_for!r}: {what}"
 
 
 def _as_module(path: str) -> str:

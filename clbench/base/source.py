@@ -225,33 +225,52 @@ def class_hash(cls: type) -> str:
     """
     digest = hashlib.sha256()
     for name, value in sorted(vars(cls).items()):
-        codes = [one.__code__ for one in _functions_of(value)]
-        if codes:
-            digest.update(f"{name} {' '.join(map(_code_text, codes))}".encode())
-        elif not name.startswith("__") and isinstance(value, str | int | float | tuple | None):
-            digest.update(f"{name} {value!r}".encode())
+        functions = list(functions_behind(value))
+        if functions or not name.startswith("__"):
+            digest.update(f"{name} {_text_of(functions)} {_text_of(value)}".encode())
     return digest.hexdigest()[:16]
 
 
-def _functions_of(value: object) -> Iterator[FunctionType]:
-    """Yield the function of a method or a property, from its outermost decorator to what is decorated."""
-    names = ("__func__", "fget", "func")
-    found = next((getattr(value, name) for name in names if hasattr(value, name)), value)
-    while isinstance(found, FunctionType):
-        yield found
-        found = getattr(found, "__wrapped__", None)
+def functions_behind(value: object) -> Iterator[FunctionType]:
+    """Yield the functions of an attribute of a class, from its outermost decorator to what is decorated.
+
+    The attribute may be a method, a property, or a function in a cache or with given arguments.
+    """
+    while value is not None and not isinstance(value, type):
+        if isinstance(value, FunctionType):
+            yield value
+        if isinstance(value, property):
+            value = value.fget
+        elif isinstance(value, functools.cached_property | functools.partialmethod | functools.partial):
+            value = value.func
+        else:
+            value = getattr(value, "__wrapped__", None)
 
 
-def _code_text(code: CodeType) -> str:
-    """Return the bytecode, names and constants of a function as text, without its line numbers."""
+def _text_of(value: object) -> str:
+    """Return code or a plain value as text that is the same in each process, without line numbers.
 
-    def text(constant: object) -> str:
-        if isinstance(constant, CodeType):
-            return _code_text(constant)
-        # sets have another order in each process
-        return repr(sorted(map(repr, constant))) if isinstance(constant, frozenset) else repr(constant)
-
-    return f"{code.co_code.hex()} {code.co_names} {list(map(text, code.co_consts))}"
+    Of other objects it is the type.
+    """
+    if isinstance(value, CodeType):
+        return f"{value.co_code.hex()} {value.co_names} {_text_of(value.co_consts)}"
+    if isinstance(value, FunctionType):
+        return _text_of((value.__code__, value.__defaults__, value.__kwdefaults__))
+    if isinstance(value, functools.partialmethod | functools.partial):
+        return _text_of((value.func, value.args, value.keywords))
+    if isinstance(value, dict):
+        return _text_of([*value.items()])
+    if isinstance(value, tuple | list):
+        return f"[{', '.join(map(_text_of, value))}]"
+    if isinstance(value, frozenset | set):  # it has another order in each process
+        return f"{sorted(map(_text_of, value))}"
+    if isinstance(value, type):
+        return value.__qualname__
+    return (
+        repr(value)
+        if isinstance(value, str | bytes | complex | float | int | None)
+        else type(value).__qualname__
+    )
 
 
 def names_in(code: CodeType) -> set[str]:

@@ -76,20 +76,21 @@ def demonstrate(world: World, task: Task, seed: int, noisy: bool) -> Demonstrati
     generator = np.random.default_rng([seed, 1])
     low, high = _action_bounds(world)
     state, _ = world.reset(seed=seed, options={"task": task.name})
-    # copies: a world may return the same array in every step
-    states, executed, labels, random, rewards = [np.array(state, np.float32)], [], [expert(state)], [], []
+    # copies: a world or an expert may return the same array in every step
+    states, executed, random, rewards = [np.array(state, np.float32)], [], [], []
+    labels = [np.array(expert(state), np.float32)]
     success, remaining = False, 0
     for _ in range(task.horizon):
         if noisy and remaining == 0 and generator.random() < task.action_noise:
             remaining = int(generator.integers(3, 7))
         action = generator.uniform(low, high).astype(np.float32) if remaining else labels[-1]
-        action = np.clip(np.asarray(action, np.float32), low, high)
+        action = np.clip(action, low, high)
         random.append(remaining > 0)
         remaining = max(0, remaining - 1)
         state, reward, terminated, _, _ = world.step(action)
         states.append(np.array(state, np.float32))
         executed.append(action)
-        labels.append(expert(state))
+        labels.append(np.array(expert(state), np.float32))
         rewards.append(float(reward))
         if terminated:
             success = True
@@ -97,7 +98,7 @@ def demonstrate(world: World, task: Task, seed: int, noisy: bool) -> Demonstrati
     return Demonstration(
         np.array(states, np.float32),
         np.array(executed, np.float32),
-        np.clip(np.array(labels, np.float32), low, high),
+        np.clip(np.array(labels), low, high),
         np.array([*random, False]),
         np.array(rewards),
         success,
@@ -202,9 +203,9 @@ def keep_dataset(task: Task, budget: Budget, episodes: Callable[[World], Sequenc
     """
     name = dataset_id(task, budget)
     folder = minari_folder() / name
-    _declare_namespaces(folder, name)
 
     def make(partial: Path) -> None:
+        _declare_namespaces(folder, name)
         with contextlib.closing(_world(task)) as world:
             _write_dataset(partial / "data", name, task, world, episodes(world))
 

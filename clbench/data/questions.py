@@ -23,6 +23,7 @@ from clbench.base.errors import InputError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import SPLIT_LABELS, derive_seed, torch_generator
 from clbench.base.source import DATA_SOURCES, source_hash
+from clbench.base.text import quoted
 from clbench.data.access import check_questions
 from clbench.data.demonstrations import demonstrate, simulator_versions
 from clbench.policy.batch import QuestionBatch
@@ -65,6 +66,8 @@ class QuestionKind:
 
     def __post_init__(self) -> None:
         check_tuple(self, str, "wordings", "answers")
+        if not self.wordings or not self.answers:
+            raise InputError(f"The kind of question {quoted(self.name)} needs a wording and an answer.")
 
 
 def scenes_folder(scenario: Scenario, progress: ProgressCallback = no_progress) -> Path:

@@ -57,17 +57,17 @@ def adapt(
     """
     with steps_counted() as taken:
         chosen = method.start_task(policy, stage)
+        parameters: list[Any] | None = None if chosen is None else list(chosen)  # runs a generator
     if budget.criterion is not None and taken():
         raise MethodError(
             f"start_task() took {counted(taken(), 'optimiser step')}. With a criterion it must take none: "
             "only the steps that follow it count, and their checks end the stage."
         )
-    if chosen is None:
+    if parameters is None:
         raise MethodError(
             "start_task() must return the parameters to train, not None: `return policy.parameters()` "
             "trains all of them."
         )
-    parameters: list[Any] = list(chosen)
     to_criterion = budget.criterion is not None
     loss: Tensor | None = None
     learning_rate: float | None = None
@@ -119,12 +119,13 @@ def check_finite(policy: Policy, after: str) -> None:
         after: What the method has just done, for the message.
 
     Raises:
-        MethodError: A parameter or a buffer is not finite.
+        MethodError: A parameter or a persistent buffer is not finite.
     """
-    for kind, tensors in (("parameter", policy.named_parameters()), ("buffer", policy.named_buffers())):
-        for name, value in tensors:
-            if not torch.isfinite(value).all():
-                raise MethodError(f"The {kind} {name} is not finite after {after}.")
+    parameters = dict(policy.named_parameters(remove_duplicate=False))
+    for name, value in policy.state_dict().items():  # without buffers that are made again, such as masks
+        if isinstance(value, Tensor) and not torch.isfinite(value).all():
+            kind = "parameter" if name in parameters else "buffer"
+            raise MethodError(f"The {kind} {name} is not finite after {after}.")
 
 
 def _not_finite(policy: Policy) -> str:

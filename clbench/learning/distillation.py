@@ -62,9 +62,9 @@ def distilled(
     head.requires_grad_(True)
 
     def loss_at(step: int) -> Tensor:
-        batch = demonstrations.sample(budget.batch_size, generator)
-        share = shares(torch.rand(len(batch), head.chunk // block, generator=generator))
-        drawn = torch.rand(len(batch), head.length, generator=generator)
+        batch = demonstrations.sample(budget.batch_size, generator).to(teacher.device)
+        share = shares(torch.rand(len(batch), head.chunk // block, generator=generator)).to(teacher.device)
+        drawn = torch.rand(len(batch), head.length, generator=generator).to(teacher.device)
         return distillation_loss(teacher, teaching, head, batch, share, drawn)
 
     with deterministic():

@@ -9,7 +9,7 @@ from traceback import walk_tb
 from types import FrameType, FunctionType
 from typing import Any
 
-from clbench.base.source import names_in
+from clbench.base.source import functions_behind, names_in
 from clbench.base.text import did_you_mean
 from clbench.learning.method import Metadata, Method
 from clbench.learning.prior import Uses
@@ -46,9 +46,12 @@ def uncalled_functions(cls: type[Method]) -> dict[str, str]:
 
     The value for each is the end of a message with the hook of the nearest name, empty if none is near.
     """
-    functions = [item for base in own_classes(cls) for item in functions_of(base).items()]
-    used = set(HOOKS).union(*(names_in(function.__code__) for _, function in functions))
-    uncalled = [name for name, _ in functions if not name.startswith("_") and name not in used]
+    functions = [name for base in own_classes(cls) for name in functions_of(base)]
+    behind = [
+        one for base in own_classes(cls) for value in vars(base).values() for one in functions_behind(value)
+    ]
+    used = set(HOOKS).union(*(names_in(one.__code__) for one in behind))
+    uncalled = [name for name in functions if not name.startswith("_") and name not in used]
     return {name: did_you_mean(f"{name}()", [f"{hook}()" for hook in HOOKS]) for name in uncalled}
 
 

@@ -119,10 +119,10 @@ class Method:
 
         If a method overrides this hook, the pretraining is repeated before `prepare`, in every scenario, and
         its steps count as the method's. The loss of the pretraining is the mean action loss on the skills
-        (and the background, if there is one) plus the mean answer loss on questions; without skills, it is
-        the answer loss alone. `parameter.grad` holds the clipped gradient of the step just taken. Change
-        nothing. Another object runs `prepare`: it gets what `state` returns after the last step. `uses` must
-        declare prior demonstrations, and need not declare questions.
+        (and the background, if there is one) plus, for a policy that answers, the mean answer loss on
+        questions; without skills, it is the answer loss alone. `parameter.grad` holds the clipped gradient of
+        the step just taken. Change nothing. Another object runs `prepare`: it gets what `state` returns after
+        the last step. `uses` must declare prior demonstrations, and need not declare questions.
 
         Args:
             policy: Policy that is being pretrained.

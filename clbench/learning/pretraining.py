@@ -68,6 +68,7 @@ def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
         "budget": {name: value for name, value in budget.items() if name not in AFTER_PRETRAINING},
         **(own or {"seed": seed}),
         "text_length": scenario.text_length,
+        "questions": scenario.questions,  # one package may have several
         "policy": scenario.policy,
         "frame": frame_hash(scenario.scene_tasks[0]),
         "source": source_hash(*TRAINING_SOURCES, *suites),
@@ -196,6 +197,7 @@ def pretrain(
     else:
         policy.normalise_like(questions.state)
         if "answers" not in policy.abilities:  # there is nothing to learn from
+            watch(policy, 0)
             progress(budget.pretraining_steps)
             return policy
     vision = policy.vision_to_pretrain()

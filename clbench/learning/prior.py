@@ -128,9 +128,12 @@ class Source(Generic[Rows]):
 
         Raises:
             MissingDataError: There is no data.
+            InputError: The number of samples is negative.
             UndeclaredAccessError: The hooks that received the source have ended, or a step draws more samples
                 of the target than `batch_size`.
         """
+        if count < 0:  # it would raise what is left
+            raise InputError(f"The number of samples must be at least 0, not {count}.")
         if self._left is not None:
             self._left -= count
             if self._left < 0:

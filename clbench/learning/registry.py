@@ -89,9 +89,16 @@ def read_changes(spec: str, cls: type[Method], changes: Mapping[str, Any]) -> di
 
     Raises:
         UnknownNameError: The method has no such hyper-parameter; the message names the nearest one.
-        InputError: A value cannot be read as the type of its field, or the method refuses it.
+        InputError: A value cannot be read as the type of its field, or the method refuses it; or the type of
+            a field cannot be read.
     """
-    hints = get_type_hints(cls)
+    try:
+        hints = get_type_hints(cls)
+    except NameError as error:
+        raise InputError(
+            f"{spec}: the type of a field cannot be read ({error}). Import the types of fields outside of "
+            "`if TYPE_CHECKING`."
+        ) from error
     fields = [field.name for field in dataclasses.fields(cls)]
     values = {}
     for name, value in changes.items():

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from safetensors import SafetensorError
 
+from clbench.base.dependencies import versions
 from clbench.base.progress import ProgressCallback, announce, no_progress
 from clbench.base.seeding import derive_seed, draws_restored, seeded, torch_generator
 from clbench.base.source import RUN_SOURCES, source_hash
@@ -127,7 +128,7 @@ class Trainer:
             )
         self.method = self.new_method()
         self.where = "load_state() after watch_pretraining"
-        with self._hooks(0):
+        with seeded("method", self.seed, 0), self._hooks(0):
             self.method.load_state(self.policy, state)
         return self.scenario.budget.pretraining_steps
 
@@ -265,4 +266,5 @@ def training_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
         "pretraining": pretraining_inputs(scenario, seed),
         "tasks": [dataclasses.asdict(task) for task in scenario.tasks],
         "source": source_hash(*RUN_SOURCES, *suites),
+        "versions": versions(("peft",)),  # of the packages that only methods use
     }

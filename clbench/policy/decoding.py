@@ -32,7 +32,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from clbench.base.errors import InputError
-from clbench.spec.fields import check_share
+from clbench.spec.fields import check_share, check_whole
 
 if TYPE_CHECKING:
     from clbench.policy.discrete import DiscreteDiffusionHead
@@ -65,6 +65,7 @@ class Thresholds:
 
     def __post_init__(self) -> None:
         check_share(self, "add", "activate")
+        check_whole(self, 1, "part")
         if max(self.add, self.activate) == 1:
             raise InputError("add and activate must be below 1: a complete block must exceed them.")
 

@@ -184,10 +184,11 @@ class Policy(nn.Module, ABC):
 
 @contextmanager
 def evaluating(policy: Policy) -> Iterator[None]:
-    """Put a policy into evaluation mode inside the block, and then back into the mode that it had."""
-    training = policy.training
+    """Put a policy into evaluation mode inside the block, then each of its modules into the mode it had."""
+    before = [(module, module.training) for module in policy.modules()]
     policy.eval()
     try:
         yield
     finally:
-        policy.train(training)
+        for module, training in before:
+            module.training = training

@@ -13,6 +13,8 @@ PATCH = 16
 """Pixels along the side of a patch; 64 x 64 pixels have 16 patches."""
 TOKENS = 4
 """Tokens of an image for the backbone, each a linear map of all patches; the state has as many."""
+LEAST_WIDTH = 6
+"""Least channels of a token: the first convolution writes a sixth of them."""
 
 
 class Vision(nn.Module):
@@ -27,13 +29,15 @@ class Vision(nn.Module):
         width: Channels of a token.
 
     Raises:
-        InputError: The image cannot be cut into patches.
+        InputError: The image cannot be cut into patches, or `width` is below `LEAST_WIDTH`.
     """
 
     def __init__(self, image_size: int, width: int) -> None:
         super().__init__()
         if image_size % PATCH:
             raise InputError(f"image_size must be a multiple of {PATCH}, not {image_size}.")
+        if width < LEAST_WIDTH:
+            raise InputError(f"width must be at least {LEAST_WIDTH} for a policy that sees, not {width}.")
         self.image_size, self.width = image_size, width
         self.tokens = TOKENS
         channels = (3, width // 6, width // 3, width // 2, width // 2)

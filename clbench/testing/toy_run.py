@@ -249,6 +249,8 @@ class ToyRun:
         try:
             with watched(changes, generators=hook in UNSEEDED), steps_counted() as taken:
                 result = function(*map(self._watched_data, arguments), **named)
+                if inspect.isgenerator(result):  # nothing of it has run yet
+                    result = list(result)
         except Exception as error:
             raise self._fault(hook, error) from error
         finally:

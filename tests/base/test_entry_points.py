@@ -89,6 +89,12 @@ def test_an_error_inside_a_third_party_module_is_one_line_that_names_it(
         import_module("faulty_module", "x")
 
 
+def test_an_import_error_with_a_text_of_its_own_keeps_it(write_module: Callable[[str, str], None]) -> None:
+    write_module("old_package", "raise ModuleNotFoundError('flash_attn is too old')")
+    with pytest.raises(InputError, match="'x': ModuleNotFoundError: flash_attn is too old"):
+        import_module("old_package", "x")
+
+
 def test_a_script_that_exits_is_no_end_of_the_command(write_module: Callable[[str, str], None]) -> None:
     write_module("exiting_module", "import sys; sys.exit(3)")
     with pytest.raises(InputError, match="'exiting_module' cannot be imported for 'x': SystemExit: 3"):

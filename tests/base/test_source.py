@@ -342,7 +342,30 @@ class Some:
     @functools.cached_property
     def limit(self):
         return {limit}
+
+    def scaled(self, by={by}):
+        return by
+
+    @functools.cache
+    def kept(self):
+        return {kept}
+
+    half = functools.partialmethod(scaled, {half})
+    table = {table}
 """
+
+USUAL: dict[str, Any] = {
+    "number": 1,
+    "name": "three",
+    "size": 4,
+    "end": 6,
+    "limit": 8,
+    "by": 10,
+    "kept": 12,
+    "half": 14,
+    "table": {"a": [1, 2]},
+    "decorator": "torch.no_grad()",
+}
 
 
 def test_the_hash_of_a_typed_class_follows_its_code_and_values_and_not_its_place() -> None:
@@ -351,23 +374,26 @@ def test_the_hash_of_a_typed_class_follows_its_code_and_values_and_not_its_place
         exec(text, space)
         return class_hash(space["Some"])
 
-    usual = {"number": 1, "name": "three", "size": 4, "end": 6, "limit": 8, "decorator": "torch.no_grad()"}
-    before = hashed(CLASS.format(**usual))
-    assert hashed("# a remark\n\n" + CLASS.format(**usual)) == before
+    before = hashed(CLASS.format(**USUAL))
+    assert hashed("# a remark\n\n" + CLASS.format(**USUAL)) == before
     for change in (
         {"number": 2},
         {"name": "four"},
         {"size": 5},
         {"end": 7},
         {"limit": 9},
+        {"by": 11},
+        {"kept": 13},
+        {"half": 15},
+        {"table": {"a": [1, 3]}},
         {"decorator": "staticmethod"},
     ):
-        assert hashed(CLASS.format(**usual | change)) != before
+        assert hashed(CLASS.format(**USUAL | change)) != before
 
 
 @pytest.mark.long
 def test_the_hash_of_a_typed_class_is_the_same_in_every_process() -> None:
-    text = CLASS.format(number=1, name="three", size=4, end=6, limit=8, decorator="torch.no_grad()")
+    text = CLASS.format(**USUAL)
     imports = "import functools, torch\nfrom clbench.base.source import class_hash\n"
     code = f"{imports}{text}\nprint(class_hash(Some))"
     command = [sys.executable, "-c", code]

@@ -15,6 +15,7 @@ import torch
 from helpers import same_demonstrations
 from numpy.typing import NDArray
 
+from clbench.base.cache import CacheError
 from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError
 from clbench.data.demonstrations import (
@@ -116,6 +117,13 @@ def test_an_empty_place_of_minari_is_no_folder_and_a_tilde_is_the_home(
 
 
 @pytest.mark.long
+def test_a_place_that_cannot_hold_datasets_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "file"))
+    with pytest.raises(CacheError, match="cannot be written: Not a directory"):
+        dataset_folder(TASK, TOY.budget)
+
+
 def test_every_kept_episode_succeeds_and_about_half_are_noisy() -> None:
     episodes = collect(load_scenario("clbench/Fetch-v1").task("press"), Budget(demonstrations=20))
     assert len(episodes) == 20
@@ -163,6 +171,23 @@ class OneArray(gymnasium.Wrapper[State, State, State, State]):
 
 def test_a_world_may_return_the_same_array_in_every_step() -> None:
     usual, other = (demonstrate(world, TASK, 3, True) for world in (ToyWorld(), OneArray(ToyWorld())))
+    assert same_demonstrations([usual], [other])
+
+
+def one_array_expert(task: str) -> Any:
+    """Return the toy's expert, which writes all actions into the same array."""
+    act, array = resolve(TASK.expert)(task), np.zeros(2)
+
+    def write(state: State) -> Any:
+        array[:] = act(state)
+        return array
+
+    return write
+
+
+def test_an_expert_may_return_the_same_array_in_every_step() -> None:
+    one_array = dataclasses.replace(TASK, expert=f"{__name__}:one_array_expert")
+    usual, other = (demonstrate(ToyWorld(), task, 3, True) for task in (TASK, one_array))
     assert same_demonstrations([usual], [other])
 
 

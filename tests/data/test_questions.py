@@ -7,6 +7,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from clbench.base.errors import InputError
 from clbench.data.demonstrations import dataset_id
 from clbench.data.questions import (
     QuestionKind,
@@ -100,6 +101,14 @@ def test_an_answer_that_no_state_gives_is_named() -> None:
         ValueError, match="No state gives the answer 'right' to the question 'place': 'where is it'"
     ):
         Questions((kind,), torch.zeros(5, 4))
+
+
+@pytest.mark.parametrize(("wordings", "answers"), [((), ("left",)), (("where is it",), ())])
+def test_a_kind_of_question_needs_a_wording_and_an_answer(
+    wordings: tuple[str, ...], answers: tuple[str, ...]
+) -> None:
+    with pytest.raises(InputError, match="The kind of question 'place' needs a wording and an answer"):
+        QuestionKind("place", wordings, answers, lambda states: np.zeros(len(states), np.int64))
 
 
 @pytest.mark.long

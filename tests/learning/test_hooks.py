@@ -74,6 +74,15 @@ class Helpful(Method):
     def losses(self, policy: Policy) -> None:
         """Do nothing."""
 
+    @property
+    def strength(self) -> float:
+        """Is what a helper of a property returns."""
+        return self.scale()
+
+    def scale(self) -> float:
+        """Return a number."""
+        return 0.5
+
     def _plot(self) -> None:
         """Do nothing."""
 

@@ -149,6 +149,18 @@ def test_a_wrong_change_is_refused_by_name(
         build_method("stranger:Acme", changes)
 
 
+def test_a_type_that_only_a_type_checker_knows_is_named(write_module: Callable[[str, str], None]) -> None:
+    text = (
+        "from __future__ import annotations\nfrom dataclasses import dataclass\nfrom clbench import Method\n"
+        "@dataclass\nclass Mine(Method):\n    scale: Factor = 1.0\n"
+    )
+    write_module("typed_module", text)
+    with pytest.raises(
+        InputError, match=r"typed_module:Mine: .*'Factor' is not defined\)\. Import the types"
+    ):
+        build_method("typed_module:Mine", {})
+
+
 @pytest.mark.parametrize("name", ["demonstrations", "questions"])
 def test_a_method_cannot_use_prior_data_that_it_does_not_declare(name: str) -> None:
     with pytest.raises(UndeclaredAccessError, match=f"uses prior {name} that it does not declare"):

@@ -11,6 +11,7 @@ import torch
 
 from clbench import load_scenario
 from clbench.base.cache import MANIFEST, cache_folder, hash_of
+from clbench.base.entry_points import resolve
 from clbench.base.seeding import derive_seed, torch_generator
 from clbench.data.demonstrations import Demonstrations, load_demonstrations
 from clbench.data.questions import load_questions
@@ -73,6 +74,15 @@ def test_weights_that_a_policy_brings_are_loaded_once_per_seed_however_many_seed
     first, again = ([pretraining_inputs(brief, seed)["weights"] for seed in range(20)] for _ in range(2))
     assert first == again
     assert Weighed.loaded - before == 20
+
+
+def test_a_policy_that_learned_other_questions_of_the_same_module_is_another_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    toy = load_scenario("clbench.testing:clbench/Toy-v0")
+    monkeypatch.setattr("clbench.testing.OTHER", resolve(toy.questions), raising=False)
+    other = dataclasses.replace(toy, questions="clbench.testing:OTHER")
+    assert pretrained_folder(other, 0) != pretrained_folder(toy, 0)
 
 
 def test_other_seeds_are_pretrained_in_the_cache() -> None:

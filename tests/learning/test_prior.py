@@ -42,6 +42,12 @@ def test_a_twin_closes_with_its_source() -> None:
         twin.sample(1)
 
 
+def test_a_negative_number_of_samples_is_refused_and_buys_no_others() -> None:
+    source = Source(numbers(), torch.Generator(), 4)
+    with pytest.raises(InputError, match="number of samples must be at least 0, not -100"):
+        source.sample(-100)
+
+
 @pytest.mark.parametrize("name", ["demonstrations", "questions"])
 def test_another_access_than_the_three_is_refused(name: str) -> None:
     with pytest.raises(InputError, match=f"Uses.{name} must be one of 'never', 'prepare', .*, not 'always'"):

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from clbench.base.errors import InputError
 from clbench.base.seeding import torch_generator
 from clbench.data.questions import Questions, load_questions
 from clbench.learning.pretraining import policy_config, pretrained_policy, vision_steps
@@ -31,6 +32,12 @@ def _new_vision() -> Vision:
     with torch.random.fork_rng():
         torch.manual_seed(3)
         return Vision(config.image_size, config.width)
+
+
+def test_a_vision_needs_a_channel_in_its_first_convolution() -> None:
+    assert Vision(32, 6).width == 6
+    with pytest.raises(InputError, match="width must be at least 6 for a policy that sees, not 5"):
+        Vision(32, 5)
 
 
 def _pictures(questions: Questions) -> list[Pictures]:

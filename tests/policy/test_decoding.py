@@ -232,5 +232,7 @@ def test_a_threshold_that_a_complete_block_cannot_exceed_is_refused() -> None:
         Thresholds(activate=1.0)
     with pytest.raises(InputError, match=r"Thresholds\.add must be from 0 to 1"):
         Thresholds(add=2.0)
+    with pytest.raises(InputError, match=r"Thresholds\.part must be .* not 0"):
+        Thresholds(part=0)
     with pytest.raises(InputError, match="cannot be cut into blocks of 3"):
         head(3)

@@ -113,6 +113,14 @@ class Endless(Hiding):
 
 
 @dataclasses.dataclass
+class Masked(Method):
+    """Adds a mask that checkpoints leave out, because it is made again."""
+
+    def prepare(self, policy: Policy, prior: Any) -> None:
+        policy.register_buffer("mask", torch.full((2,), -torch.inf), persistent=False)
+
+
+@dataclasses.dataclass
 class Greedy(Method):
     """Draws a second batch of the target from its third step on."""
 
@@ -221,6 +229,13 @@ def test_the_seconds_of_a_run_hold_those_of_its_preparation_and_of_relearning(
     # the run itself takes its beginning from the real clock, a little later than here
     late = 11_050 - record.timing["seconds"]
     assert -0.01 < late < time.perf_counter() - begin + 0.01
+
+
+def test_a_mask_that_no_checkpoint_holds_need_not_be_finite(
+    stranger: Callable[[type[Method]], str], tmp_path: Path
+) -> None:
+    record = execute(RunSpec(TINY.id, stranger(Masked), seed=0, targets=1), tmp_path)
+    assert record.status == "success", record.error
 
 
 @pytest.mark.parametrize(
