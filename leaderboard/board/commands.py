@@ -30,7 +30,7 @@ def run_command(scenario: str, *labels: str, records: Path = RECORDS) -> str:
     factor = labels[0].partition("@")[2]
     changes += [(FACTOR, factor)] if factor else []
     settings = [f"--set.{name} {value}" for name, value in changes]
-    folder = (LADDER if factor else CONTROLS) if changes else records
+    folder = (records.with_name(LADDER.name) if factor else CONTROLS) if changes else records
     option = [] if folder == RECORDS else [f"--records {shlex.quote(folder.as_posix())}"]
     return " ".join(["clbench run", scenario, *methods, *settings, *option])
 

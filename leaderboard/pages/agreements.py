@@ -275,6 +275,8 @@ def _common(
 ) -> tuple[Array, Array]:
     """Return two metrics of the methods that both lists have, higher is better, (methods, seeds).
 
+    Both arrays are empty if there is no such method.
+
     Args:
         rows: Rows of a scenario.
         others: Rows of another scenario, or of the same one.
@@ -284,8 +286,7 @@ def _common(
     ours, theirs = values_by_seed(rows, metric), values_by_seed(others, other_metric)
     both = [method for method in ours if method in theirs]
     one, other = (
-        (1.0 if load_metric(name).higher_is_better else -1.0)
-        * np.array([values[method] for method in both]).reshape(len(both), -1)
+        (1.0 if load_metric(name).higher_is_better else -1.0) * np.array([values[method] for method in both])
         for name, values in ((metric, ours), (other_metric, theirs))
     )
     return one, other

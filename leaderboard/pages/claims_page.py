@@ -6,6 +6,8 @@ The same findings give the same bytes.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table as TerminalTable
@@ -26,8 +28,15 @@ CHECKS = {"replayed": "replayed {}", "retrained": "repeated {} as a whole"}
 """What another process did with the records of a tier."""
 
 
-def page(judged: Sequence[Judged]) -> str:
-    """Return the page as Markdown."""
+def page(judged: Sequence[Judged], records: Path, *, published: bool) -> str:
+    """Return the page as Markdown.
+
+    Args:
+        judged: Findings on the claims.
+        records: Folder of the records, which commands on the page name.
+        published: Whether the records are the published ones: only then does the page tell how they came
+            about.
+    """
     by_claim = grouped((one.claim, one) for one in judged)
     refused = {entry.path: entry for one in judged for entry in one.evidence.not_used}
     return template(__file__, "claims.md.jinja").render(
@@ -36,8 +45,9 @@ def page(judged: Sequence[Judged]) -> str:
         verdicts=verdicts(judged),
         papers=grouped((claim.paper, (claim, members)) for claim, members in by_claim.items()).items(),
         not_used=list(refused.values()),
-        missing=_missing,
+        missing=partial(_missing, records),
         checked=_checked,
+        published=published,
     )
 
 
@@ -61,15 +71,14 @@ def _corrected(here: Sequence[Judged]) -> str:
     return f"{first}; {later or 'none'} of the {counted(len(here), 'rule')} changed after it."
 
 
-def _missing(one: Judged) -> list[str]:
-    """Return the commands that make what the figures of a finding lack."""
+def _missing(records: Path, one: Judged) -> list[str]:
+    """Return the commands that make what the figures of a finding lack in a folder of records."""
     figures = (*one.finding.figures, *one.finding.controls)
     labels = dict.fromkeys(label for figure in figures for label in figure.missing)
     plain = [label for label in labels if "+" not in label and "@" not in label]
     scenario = one.evidence.scenario
-    lines = [f"`{run_command(scenario, *plain)}`."] if plain else []
-    lines += [f"`{run_command(scenario, label)}`." for label in labels if label not in plain]
-    return lines
+    groups = [plain, *([label] for label in labels if label not in plain)]
+    return [f"`{run_command(scenario, *group, records=records)}`." for group in groups if group]
 
 
 def _checked(one: Judged) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -48,7 +49,7 @@ def claims(
     judged = judge_all(evidence, None if scenario is None else without_module(scenario))
     console = Console()
     console.print(terminal(judged))
-    _write({output: page(judged)})
+    _write({output: page(judged, records, published=_holds_published(records))})
 
 
 def findings(
@@ -70,7 +71,8 @@ def findings(
     evidence = _evidence(None, records, controls)
     board = _board(records)
     judged = judge_all(evidence)
-    text = page(in_short(board, judged), sections(board, judged, evidence))
+    told = in_short(board, judged), sections(board, judged, evidence)
+    text = page(*told, published=_holds_published(records))
     drawn = {output.parent / "findings" / name: svg for name, svg in pictures(board).items()}
     _write({output: text, **drawn})
 
@@ -112,8 +114,8 @@ def scenario_card(
     """Write the card of each of SCENARIOS: its tasks with pictures, and whether it tells methods apart.
 
     The command measures experts and draws pictures only where they are missing from the folder of the card.
-    If no renderer works, the command leaves out missing pictures and says so. If a scenario lacks a package,
-    its card stays as it is, unless you name the scenario.
+    If no renderer works, the command leaves out missing pictures, deletes outdated ones and says so. If a
+    scenario lacks a package, its card stays as it is, unless you name the scenario.
 
     Args:
         scenarios: Gymnasium ids (default: all scenarios with records, or with a card in the folder).
@@ -152,7 +154,7 @@ def scenario_card(
             typed[scenario.id], homes[output / folder_name(scenario.id)] = name, scenario
     fault = choose_renderer([task for home, scenario in homes.items() for task in undrawn(scenario, home)])
     if fault is not None:
-        print_plain(console, f"No pictures are drawn; existing ones are kept. {fault}")
+        print_plain(console, f"No pictures are drawn; existing ones are kept unless outdated. {fault}")
     for home, scenario in homes.items():
         experts = make_missing(scenario, home, episodes, drawing=fault is None, console=console)
         drawn = {task.name for task in scenario.tasks if picture_path(home, task).is_file()}
@@ -183,6 +185,15 @@ def _evidence(
             text = f"There is no folder {folder}: verdicts may differ from the published ones."
             print_plain(Console(stderr=True), text, "yellow")
     return read_evidence(records, controls)
+
+
+def _holds_published(records: Path) -> bool:
+    """Return whether a folder has all published records, unchanged."""
+    from ..publishing import PUBLISHED
+
+    names = [path.relative_to(PUBLISHED).as_posix() for path in PUBLISHED.rglob("seed-*.json")]
+    same, _, _ = filecmp.cmpfiles(PUBLISHED, records, names)
+    return bool(names) and same == names
 
 
 def _board(records: Path) -> Board:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from operator import itemgetter
+from typing import TypeAlias
 
 from clbench.base.text import counted, listed
 from clbench.records.paths import table_parts
@@ -23,13 +24,13 @@ from ..claims.evidence import Evidence
 from ..claims.judges import Judged
 from ..policies.compared import Comparison, by_table
 from ..views.charts.picture import in_both_themes
-from ..views.format import MISSING, format_interval
+from ..views.format import MISSING, format_over_seeds
 from ..views.sections import Section, Table, short
 from ..views.templating import template
 from .agreements import orders_section, predictors_section
 from .claims_page import claims_section
 from .findings_charts import gains_chart, rates_chart
-from .gains import by_gain, gains_section, replay_section
+from .gains import by_gain, gains_section, is_tuned, replay_section, without_tied_runs
 from .learning_rates import rates_section
 from .lost_skills import lost_skills_section
 
@@ -37,9 +38,17 @@ FORGOTTEN_BY = "kept_share"
 """Metric by which policies are compared: the final average also counts what they knew and learned."""
 
 
-def page(in_short: Sequence[str], sections: Sequence[Section]) -> str:
-    """Return the page as Markdown: what `in_short` says, and the sections."""
-    return template(__file__, "findings.md.jinja").render(in_short=in_short, sections=sections)
+def page(in_short: Sequence[str], sections: Sequence[Section], *, published: bool) -> str:
+    """Return the page as Markdown: what `in_short` says, and the sections.
+
+    Args:
+        in_short: The answers that most readers look for.
+        sections: All sections.
+        published: Whether the records are the published ones: only then does the page tell how they came
+            about.
+    """
+    values = {"in_short": in_short, "sections": sections, "published": published}
+    return template(__file__, "findings.md.jinja").render(values)
 
 
 def pictures(board: Board) -> dict[str, str]:
@@ -75,8 +84,10 @@ def sections(board: Board, judged: Sequence[Judged], evidence: Callable[[str], E
 
 def in_short(board: Board, judged: Sequence[Judged]) -> list[str]:
     """Return the answers that most readers look for; `sections` have their figures and limits."""
+    boards = _boards(board)
     above: dict[str, list[Row]] = {}
-    for name, rows in _boards(board).items():
+    baseline = "tuned plain fine-tuning" if is_tuned(boards.values()) else "plain fine-tuning"
+    for name, rows in boards.items():
         sides = sides_of_gains(rows, board.tied.get(name, {}))
         if others := by_gain(rows):
             above[name] = [row for row in others if sides.get(row.method) == 1]
@@ -85,17 +96,15 @@ def in_short(board: Board, judged: Sequence[Judged]) -> list[str]:
     for data, names in divisions.items() if above else ():
         best = {name: [row for row in rows if row.division in names][:1] for name, rows in above.items()}
         gains = grouped(
-            (row.method, f"{format_interval(row.estimates['gain'])} on {short(name)}")
+            (row.method, f"{format_over_seeds(row.estimates['gain'])} on {short(name)}")
             for name, rows in best.items()
             for row in rows
         )
         parts = [f"`{method}` gains {listed(texts)}" for method, texts in gains.items()]
         if none := [name for name, rows in best.items() if not rows]:
-            parts.append(
-                f"no method is certainly better than tuned plain fine-tuning on {listed(map(short, none))}"
-            )
+            parts.append(f"no method is certainly better than {baseline} on {listed(map(short, none))}")
         answers.append(f"{data} prior demonstrations: {'; '.join(parts)}.")
-    return answers + _claims_in_short(judged)
+    return [*answers, *without_tied_runs(boards, board.tied), *_claims_in_short(judged)]
 
 
 def _claims_in_short(judged: Sequence[Judged]) -> list[str]:
@@ -124,10 +133,14 @@ def _usual(board: Board) -> dict[str, list[Row]]:
     }
 
 
+_Losses: TypeAlias = tuple[bool, str, tuple[float | None, float | None]]
+"""Whether stages end at the criterion, the scenario, and the losses of skills and of answers."""
+
+
 def _knowledge(boards: dict[str, list[Row]]) -> Section:
     """Return whether skills and answers to questions are lost together."""
     lines: list[tuple[str, ...]] = []
-    losses: list[tuple[bool, str, float, float]] = []
+    losses: list[_Losses] = []
     for name, rows in boards.items():
         by_method = {row.method: row for row in rows}
         if BASELINE not in by_method or FROZEN not in by_method:
@@ -137,7 +150,7 @@ def _knowledge(boards: dict[str, list[Row]]) -> Section:
             continue
         to_criterion = by_method[BASELINE].to_criterion
         skills, answers = ((before[one], after[one]) for one in ("retention", "question_retention"))
-        losses.append((to_criterion, short(name), _loss(*skills), _loss(*answers)))
+        losses.append((to_criterion, short(name), (_loss(*skills), _loss(*answers))))
         stages = "to the criterion" if to_criterion else "of a fixed length"
         lines.append((short(name), stages, _change(*skills), _change(*answers)))
     head = ("scenario", "stages", "success on the skills", "share of correct answers")
@@ -148,25 +161,27 @@ def _knowledge(boards: dict[str, list[Row]]) -> Section:
 
 def _change(before: Estimate, after: Estimate) -> str:
     """Return the cell of a quantity before and after training."""
-    return MISSING if after.value is None else f"{format_interval(before)} to {format_interval(after)}"
+    return MISSING if after.value is None else f"{format_over_seeds(before)} to {format_over_seeds(after)}"
 
 
-def _loss(before: Estimate, after: Estimate) -> float:
-    """Return how much a quantity fell; 0 if it is missing."""
-    return 0.0 if before.value is None or after.value is None else before.value - after.value
+def _loss(before: Estimate, after: Estimate) -> float | None:
+    """Return how much a quantity fell, None if it is missing."""
+    return None if before.value is None or after.value is None else before.value - after.value
 
 
-def _largest_losses(losses: Sequence[tuple[bool, str, float, float]]) -> list[str]:
+def _largest_losses(losses: Sequence[_Losses]) -> list[str]:
     """Return the largest losses of skills and of answers, for stages of each kind, with their scenarios."""
     sentences = []
     for kind, words in ((True, "end at the criterion"), (False, "have a fixed length")):
-        found = [one[1:] for one in losses if one[0] == kind]
-        if found:
-            skills, answers = (max(found, key=itemgetter(place)) for place in (1, 2))
-            sentences.append(
-                f"Where stages {words}, success on the skills falls by up to {skills[1]:.2f} ({skills[0]}), "
-                f"and the share of correct answers by up to {answers[2]:.2f} ({answers[0]})."
-            )
+        found = [(name, lost) for is_kind, name, lost in losses if is_kind == kind]
+        halves: list[str] = []
+        for place, what in enumerate(("success on the skills", "the share of correct answers")):
+            known = [(loss, name) for name, lost in found if (loss := lost[place]) is not None]
+            if known:
+                loss, name = max(known, key=itemgetter(0))
+                halves.append(f"{what}{'' if halves else ' falls'} by up to {loss:.2f} ({name})")
+        if halves:
+            sentences.append(f"Where stages {words}, {', and '.join(halves)}.")
     return sentences
 
 
@@ -195,11 +210,9 @@ OTHER_REASONS = (
 
 
 def _policy_line(scenario: str, policy: str, one: Comparison) -> tuple[str, ...]:
-    """Return the cells of a method; a single seed has no interval."""
-    cells = [
-        format_interval(estimate if one.seeds > 1 else Estimate(estimate.value, None, None))
-        for estimate in (*one.estimates[FORGOTTEN_BY], *one.estimates["adaptation"][:2])
-    ]
+    """Return the cells of a method."""
+    estimates = (*one.estimates[FORGOTTEN_BY], *one.estimates["adaptation"][:2])
+    cells = map(format_over_seeds, estimates)
     return (short(scenario), f"`{one.method}`", policy, *cells, str(one.seeds))
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
+from clbench.scoring.intervals import Estimate
+
 from ..board.frontier import Curve
 from ..board.rows import Row
 from ..board.summary import DIVISIONS
@@ -37,7 +39,7 @@ def _panel(name: str, rows: Sequence[Row]) -> Spec:
         {
             "method": row.method,
             "division": row.division,
-            **{end: rounded(getattr(row.estimates["gain"], end)) for end in ("low", "value", "high")},
+            **_ends(row.estimates["gain"]),
         }
         for row in rows
     ]
@@ -72,6 +74,12 @@ def _panel(name: str, rows: Sequence[Row]) -> Spec:
             },
         ],
     }
+
+
+def _ends(gain: Estimate) -> dict[str, float | None]:
+    """Return a gain with the ends of its interval; one seed has none, so the ends are the gain itself."""
+    names = ("low", "value", "high")
+    return {end: rounded(getattr(gain, end if gain.of_seeds else "value")) for end in names}
 
 
 def _rates(name: str, curves: Sequence[Curve]) -> Spec:

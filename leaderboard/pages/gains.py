@@ -10,10 +10,10 @@ from clbench.scoring.groups import differences_needed
 from clbench.scoring.intervals import Estimate
 from clbench.spec.references import BASELINE
 
-from ..board.certainty import TiedGain, side_of_zero, sides_of_gains
+from ..board.certainty import TiedGain, sides_of_gains
 from ..board.rows import Row
 from ..board.summary import RANKED_BY, WITHOUT_DEMONSTRATIONS, competing
-from ..views.format import MISSING, format_interval, gain_text, number_text, rate_text
+from ..views.format import MISSING, format_over_seeds, gain_text, no_tied_runs, number_text, rate_text
 from ..views.sections import Section, Table, short
 
 Tied = Mapping[str, Mapping[str, Sequence[TiedGain]]]
@@ -25,6 +25,22 @@ def by_gain(rows: Iterable[Row]) -> list[Row]:
     found = [row for row in competing(rows) if row.method != BASELINE]
     known = [row for row in found if row.estimates["gain"].value is not None]
     return sorted(known, key=lambda row: -(row.estimates["gain"].value or 0.0))
+
+
+def is_tuned(boards: Iterable[Iterable[Row]]) -> bool:
+    """Return whether tuning chose the settings of plain fine-tuning on all boards that have it."""
+    return all(row.tried is not None for rows in boards for row in rows if row.method == BASELINE)
+
+
+def without_tied_runs(boards: Mapping[str, Sequence[Row]], tied: Tied) -> Iterator[str]:
+    """Yield the boards without a certain gain because plain fine-tuning lacks runs at a tied setting."""
+    for name, rows in boards.items():
+        lacking = [
+            [one for one in tied.get(name, {}).get(row.method, ()) if not one.seeds] for row in by_gain(rows)
+        ]
+        if lacking and all(lacking):
+            why = no_tied_runs(lacking[0][0])
+            yield f"On {short(name)}, no gain is certain: for plain fine-tuning, {why}."
 
 
 # ---- without prior demonstrations --------------------------------------------------------------------------
@@ -59,7 +75,8 @@ def gains_section(boards: Mapping[str, Sequence[Row]], tied: Tied) -> Section:
         answers += _over_tied_settings(name, tied.get(name, {}))
     head = ("scenario", "compared", "largest gain", "a gain must exceed", "told apart")
     tables = (Table((*head, "interval excludes 0, not told apart"), tuple(lines)),) if lines else ()
-    question = "Does a method without prior demonstrations beat tuned fine-tuning?"
+    kind = "tuned" if is_tuned(judged.values()) else "plain"
+    question = f"Does a method without prior demonstrations beat {kind} fine-tuning?"
     picture = "gains" if any(by_gain(rows) for rows in boards.values()) else ""
     return Section(question, tuple(answers), tables, (FAMILY,) if lines else (), picture)
 
@@ -78,7 +95,7 @@ def _told_above(
     better = [method for method, gain in gains.items() if method in sides and (gain.value or 0.0) > 0]
     certain = [method for method in better if sides[method] == 1]
     if certain:
-        named = ", ".join(f"`{method}` by {format_interval(gains[method], '.3f')}" for method in certain)
+        named = ", ".join(f"`{method}` by {format_over_seeds(gains[method], '.3f')}" for method in certain)
         yield f"On {short(name)}, yes: {named}."
     for method in better:
         if method not in certain or tied.get(method):
@@ -110,12 +127,14 @@ def _gain_cell(row: Row, tied: Sequence[TiedGain]) -> str:
     """Return a method with its gain, and what speaks against reading it alone."""
     gain, met = row.estimates["gain"], row.estimates["criterion_met"].value
     remarks = []
-    if gain.is_above(0) and side_of_zero(gain, tied) != 1:
-        remarks.append("not over the tied setting")
+    unsure = [one for one in tied if not one.is_certain]
+    if gain.is_above(0) and unsure:
+        measured = any(one.seeds for one in unsure)
+        remarks.append("not over the tied setting" if measured else "no runs at the tied setting")
     if met is not None and met < 1:
         remarks.append(f"{1 - met:.0%} of its stages missed the criterion")
     remark = f" ({'; '.join(remarks)})" if remarks else ""
-    return f"`{row.method}` {format_interval(gain, '.3f')}{remark}"
+    return f"`{row.method}` {format_over_seeds(gain, '.3f')}{remark}"
 
 
 def _smallest_told_apart(rows: Iterable[Row], methods: Collection[str]) -> str:
@@ -139,8 +158,8 @@ def _over_tied_settings(name: str, tied: Mapping[str, Sequence[TiedGain]]) -> It
             yield (
                 f"On {short(name)}, tuning rated plain fine-tuning at {rate_text(one.factor)} as highly as "
                 f"at the chosen one. In the test episodes of {counted(one.seeds, 'seed')} it ends "
-                f"{format_interval(more, '.3f')} higher than at the chosen one, so every gain on this board "
-                "is smaller when it is measured over the tied setting."
+                f"{format_over_seeds(more, '.3f')} higher than at the chosen one, so every gain on this "
+                "board is smaller when it is measured over the tied setting."
             )
 
 
@@ -165,14 +184,14 @@ def replay_section(boards: Mapping[str, Sequence[Row]], tied: Tied) -> Section:
         boards: Rows of each scenario at equal learning.
         tied: Gains over plain fine-tuning at tied settings.
     """
+    keeping = {name: [row for row in by_gain(rows) if _keeps_data(row)] for name, rows in boards.items()}
     lines: list[tuple[str, ...]] = []
     certain: list[bool] = []
-    for name, rows in boards.items():
-        sides = sides_of_gains(rows, tied.get(name, {}))
-        members = [row for row in by_gain(rows) if _keeps_data(row)]
+    for name, members in keeping.items():
+        sides = sides_of_gains(boards[name], tied.get(name, {}))
         certain += [sides.get(row.method) == 1 for row in members]
         lines += [_replay_line(row, "" if sides.get(row.method) else " (not certain)") for row in members]
-        lines += [_replay_line(row) for row in rows if row.method == BASELINE and members]
+        lines += [_replay_line(row) for row in boards[name] if row.method == BASELINE and members]
     question = "What do prior demonstrations buy?"
     if not lines:
         return Section(question, ())
@@ -188,7 +207,8 @@ def replay_section(boards: Mapping[str, Sequence[Row]], tied: Tied) -> Section:
         "steps to learn a target",
         "stages that missed the criterion",
     )
-    return Section(question, (answer,), (Table(head, tuple(lines)),), (WHAT_IS_KEPT, OWN_RATES))
+    answers = (answer, *without_tied_runs(keeping, tied))
+    return Section(question, answers, (Table(head, tuple(lines)),), (WHAT_IS_KEPT, OWN_RATES))
 
 
 def _keeps_data(row: Row) -> bool:
@@ -200,8 +220,8 @@ def _replay_line(row: Row, doubt: str = "") -> tuple[str, ...]:
     kept, met = row.costs.get("bytes_kept"), row.estimates["criterion_met"].value
     return (
         *(short(row.scenario), f"`{row.method}`"),
-        MISSING if row.method == BASELINE else f"{format_interval(row.estimates['gain'])}{doubt}",
+        MISSING if row.method == BASELINE else f"{format_over_seeds(row.estimates['gain'])}{doubt}",
         megabytes(int(kept or 0)),
-        format_interval(row.estimates["steps_to_criterion"], ".0f"),
+        format_over_seeds(row.estimates["steps_to_criterion"], ".0f"),
         number_text(None if met is None else 1 - met, ".0%"),
     )

@@ -13,14 +13,15 @@ from ..board.frontier import Curve, Rung
 from ..board.rows import Row
 from ..board.summary import WITHOUT_DEMONSTRATIONS
 from ..claims.evidence import Evidence, rung
-from ..views.format import MISSING, format_interval, rate_text
+from ..views.format import MISSING, format_over_seeds, rate_text
 from ..views.sections import Section, Table, short
 
 Curves = Mapping[str, Sequence[Curve]]
 
 NOTES = (
     "The best rate and the best method were chosen on the same episodes. What a smaller rate gains is "
-    "therefore biased upwards; the other differences may be biased either way. All are paired by seed.",
+    "therefore biased upwards; the other differences may be biased either way. All are paired by seed. A "
+    "difference counts every seed that its two sides share, even if other runs of the ladder lack it.",
     f"`{FROZEN}` learns nothing. A target that was never learned counts as not kept.",
     "Factors multiply the scenario's learning rate. The leaderboard has all of them, with intervals.",
 )
@@ -62,9 +63,9 @@ class _Ladder:
     evidence: Evidence
 
     @property
-    def first(self) -> Rung:
-        """Its largest learning rate, that of the scenario."""
-        return self.baseline.rungs[0]
+    def usual(self) -> Rung | None:
+        """The scenario's learning rate, None if it has no runs."""
+        return _usual(self.baseline)
 
     @property
     def best(self) -> Rung:
@@ -72,36 +73,34 @@ class _Ladder:
         return max(self.baseline.rungs, key=lambda one: one.kept.value or 0.0)
 
     def answer(self) -> str:
-        """Return what its best learning rate gains."""
-        gain = self.evidence.difference(
-            "kept", *(rung(BASELINE, one.factor) for one in (self.best, self.first))
-        )
-        certain = "" if gain.estimate.is_above(0) else ", which is not certain"
-        at = rate_text(self.best.factor)
-        if self.best is self.first:
+        """Return what its best learning rate gains over the scenario's."""
+        best, usual = self.best, self.usual
+        at = rate_text(best.factor)
+        if usual is None or best is usual:
             return f"On {short(self.name)}, plain fine-tuning keeps most at {at}."
+        labels = (rung(BASELINE, one.factor) for one in (best, usual))
+        gain = self.evidence.difference("kept", *labels).estimate
+        certain = "" if gain.is_above(0) else ", which is not certain"
         return (
-            f"On {short(self.name)}, plain fine-tuning at {at} keeps {format_interval(gain.estimate)} more "
-            f"than at {rate_text(self.first.factor)}{certain}, and learns "
-            f"{format_interval(self.best.learned)}."
+            f"On {short(self.name)}, plain fine-tuning at {at} keeps {format_over_seeds(gain)} more "
+            f"than at {rate_text(usual.factor)}{certain}, and learns {format_over_seeds(best.learned)}."
         )
 
     def cells(self) -> dict[str, str]:
         """Return what is kept, and the differences, by their labels."""
-        first, best = (rung(BASELINE, one.factor) for one in (self.first, self.best))
+        best = rung(BASELINE, self.best.factor)
+        usual = rung(BASELINE, 1) if self.usual else ""
         others = self._others()
-        rival = others[0] if others else None
-        label = rung(rival.method, self.first.factor) if rival else ""
+        method, rival = next(iter(others.items()), ("", None))
+        label = rung(method, 1) if rival else ""
         frozen = next((row for row in self.rows if row.method == FROZEN), None)
         return {
-            "plain fine-tuning at the scenario's learning rate": _at(self.first),
+            "plain fine-tuning at the scenario's learning rate": _at(self.usual) if self.usual else MISSING,
             "plain fine-tuning at its best rate": f"{_at(self.best)}, best of {len(self.baseline.rungs)}",
             "best method without prior demonstrations at the scenario's learning rate": (
-                f"`{rival.method}` {_at(rival.rungs[0])}, best of {counted(len(others), 'method')}"
-                if rival
-                else MISSING
+                f"`{method}` {_at(rival)}, best of {counted(len(others), 'method')}" if rival else MISSING
             ),
-            "this method minus plain fine-tuning at the scenario's learning rate": self._more(label, first),
+            "this method minus plain fine-tuning at the scenario's learning rate": self._more(label, usual),
             "this method minus plain fine-tuning at its best rate": self._more(label, best),
             f"`{FROZEN}`": _with_seeds(frozen.estimates["kept"], frozen.seeds) if frozen else MISSING,
             f"plain fine-tuning at its best rate minus `{FROZEN}`": self._more(
@@ -109,16 +108,16 @@ class _Ladder:
             ),
         }
 
-    def _others(self) -> list[Curve]:
-        """Return the methods without prior demonstrations that ran at the largest rate, by what they keep."""
-        found = [
-            curve
+    def _others(self) -> dict[str, Rung]:
+        """Return methods without prior demonstrations at the scenario's learning rate, by what they keep."""
+        found = {
+            curve.method: one
             for curve in self.curves
             if curve.division in WITHOUT_DEMONSTRATIONS
             and not curve.is_baseline
-            and curve.rungs[0].factor == self.first.factor
-        ]
-        return sorted(found, key=lambda curve: -(curve.rungs[0].kept.value or 0.0))
+            and (one := _usual(curve)) is not None
+        }
+        return dict(sorted(found.items(), key=lambda item: -(item[1].kept.value or 0.0)))
 
     def _more(self, method: str, other: str) -> str:
         """Return how much more a method keeps than another, seed by seed, with the number of seeds."""
@@ -128,6 +127,11 @@ class _Ladder:
         return _with_seeds(found.estimate, found.seeds)
 
 
+def _usual(curve: Curve) -> Rung | None:
+    """Return the runs of a curve at the scenario's learning rate, None without any."""
+    return next((one for one in curve.rungs if one.factor == 1), None)
+
+
 def _at(one: Rung) -> str:
     """Return what a rate keeps, and the rate if it is not the scenario's."""
     rate = "" if one.factor == 1 else f" at factor {one.factor:g}"
@@ -135,4 +139,4 @@ def _at(one: Rung) -> str:
 
 
 def _with_seeds(estimate: Estimate, seeds: Sequence[int]) -> str:
-    return f"{format_interval(estimate)}, {counted(len(seeds), 'seed')}"
+    return f"{format_over_seeds(estimate)}, {counted(len(seeds), 'seed')}"

@@ -51,10 +51,15 @@ def lost_skills_section(boards: Mapping[str, Sequence[Row]]) -> Section:
 
 
 def _return_of(lost: Sequence[Relearning]) -> str:
-    """Return the end of a sentence on how fast lost skills come back; empty for a single run."""
-    if len(lost) < 2:
-        return ""
-    return f", and meets the criterion again after {_steps(lost)} steps on the skill's demonstrations"
+    """Return the end of a sentence on how fast lost skills come back, and on how many never do."""
+    met = [one for one in lost if one.met]
+    never = len(lost) - len(met)
+    if not met:
+        return ", and never meets the criterion again" if never else ""
+    after = f" after {_steps(met)} steps on the skill's demonstrations" if len(met) > 1 else ""
+    if never:
+        return f", and meets the criterion again{after} in {len(met)} of them; in {never}, it never does"
+    return f", and meets the criterion again{after}" if after else ""
 
 
 def _cells(lost: Sequence[Relearning], unpretrained: Row | None) -> tuple[str, str, str, str]:

@@ -80,7 +80,8 @@ def make_missing(
 ) -> Experts:
     """Measure the experts and draw the pictures that are missing from the folder of the card.
 
-    Pictures of tasks that the scenario no longer has are deleted.
+    Pictures of tasks that the scenario no longer has are deleted, and so are pictures of former versions that
+    cannot be drawn again.
 
     Args:
         scenario: Scenario with the tasks.
@@ -89,7 +90,8 @@ def make_missing(
         drawing: Whether pictures can be drawn.
         console: Console that shows the progress.
     """
-    kept, bare = _read(folder), undrawn(scenario, folder) if drawing else []
+    kept, missing = _read(folder), undrawn(scenario, folder)
+    bare = missing if drawing else []
     asked = {task.name: {"version": task.version, "episodes": episodes} for task in scenario.tasks}
     stale = [
         task for task in scenario.tasks if not asked[task.name].items() <= kept.get(task.name, {}).items()
@@ -103,7 +105,9 @@ def make_missing(
         bars.finish(
             scenario.id, f"{counted(len(stale), 'expert')} measured, {counted(len(bare), 'picture')} drawn"
         )
-    for path in {*folder.glob("*.webp")} - {picture_path(folder, task) for task in scenario.tasks}:
+    # A picture of a former version would count as one of the version that the file names from now on.
+    current = {picture_path(folder, task) for task in scenario.tasks if task in bare or task not in missing}
+    for path in {*folder.glob("*.webp")} - current:
         path.unlink()
     found = {task.name: kept[task.name] for task in scenario.tasks}
     lines = (f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in found.items())

@@ -225,6 +225,11 @@ def format_interval(estimate: Estimate, form: str = ".2f") -> str:
     return value if estimate.low is None else f"{value} [{low}, {high}]"
 
 
+def format_over_seeds(estimate: Estimate, form: str = ".2f") -> str:
+    """Return a value with its interval, if the interval describes other seeds: that of one seed does not."""
+    return format_interval(estimate if estimate.of_seeds else Estimate(estimate.value, None, None), form)
+
+
 def aligned(letters: str | None, rows: Iterable[RowSummary]) -> str:
     """Return the letters of a row, each in the column of its group: "a", "ab" and " b" below each other.
 
@@ -307,12 +312,13 @@ def gain_text(name: str, words: str, gain: Estimate, tied: Sequence[TiedGain]) -
         tied: Gains over the settings that tuning rated as highly.
     """
     doubt = "" if side_of_zero(gain, tied) == 1 else "not "
-    parts = [f"{format_interval(gain, '.3f')} over plain fine-tuning at the setting that tuning chose"]
+    chosen = " at the setting that tuning chose" if tied else ""
+    parts = [f"{format_over_seeds(gain, '.3f')} over plain fine-tuning{chosen}"]
     for one in tied:
         at = no_tied_runs(one)
         if one.seeds:
             seeds = counted(one.seeds, "seed")
-            value = format_interval(one.gain, ".3f")
+            value = format_over_seeds(one.gain, ".3f")
             at = f"{value} at {rate_text(one.factor)}, which scored the same in tuning ({seeds})"
         parts.append(f"{'and' if one.is_certain else 'but'} {at}")
     return f"On {name}, the gain of {words} is {doubt}certain: it is {', '.join(parts)}."

@@ -1,5 +1,8 @@
 """The commands that write pages: what they are asked for, and what they refuse."""
 
+import re
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -49,3 +52,38 @@ def test_cards_for_a_folder_that_is_a_file_are_refused_before_any_expert_is_meas
         scenario_card(f"clbench.testing:{TOY}", records=four_methods, output=tmp_path / "file")
     said = capsys.readouterr().err
     assert said == f"error: --output {tmp_path / 'file'} cannot be written to: Not a directory.\n"
+
+
+@pytest.mark.parametrize("command", [claims, findings])
+def test_how_the_published_records_came_about_is_told_only_on_pages_made_from_them(
+    command: Callable[..., None], four_methods: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    published = shutil.copytree(four_methods, tmp_path / "published")
+    monkeypatch.setattr("clbench.leaderboard.publishing.PUBLISHED", published)
+
+    def page() -> str:
+        output = tmp_path / "docs" / "page.md"
+        command(records=four_methods, controls=tmp_path / "controls", output=output)
+        return output.read_text(encoding="utf-8")
+
+    told = "more seeds after a first look"
+    whole = page()
+    assert told in whole
+    (published / "Toy-v0" / "sft" / "seed-0.json").write_text("{}", encoding="utf-8")
+    assert told not in page()
+    shutil.rmtree(published)  # whoever has no published records has made none of the pages from them
+    text = page()
+    assert told not in text
+    assert "\n\n\n" not in whole + text
+    assert "`leaderboard/decoding.json`, which comes with clbench" in text
+
+
+def test_the_commands_for_missing_records_name_the_folder_of_the_records(
+    four_methods: Path, tmp_path: Path
+) -> None:
+    output = tmp_path / "claims.md"
+    claims(records=four_methods, controls=tmp_path, scenario=TOY, output=output)
+    commands = re.findall(r"- Missing: `(clbench run .*?)`", output.read_text(encoding="utf-8"))
+    plain = [one for one in commands if "--set." not in one]
+    assert plain
+    assert all(one.endswith(f" --records {four_methods}") for one in plain)

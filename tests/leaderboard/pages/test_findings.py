@@ -19,18 +19,6 @@ from clbench.scoring.intervals import Estimate
 findings = resolve("clbench.leaderboard.pages.cli:findings")
 
 
-@pytest.fixture
-def page(even_board: Callable[..., Path], tmp_path: Path) -> Callable[[], str]:
-    """Return a function that makes the page, without the backslashes of Markdown."""
-
-    def make() -> str:
-        output = tmp_path / "docs" / "findings.md"
-        findings(records=tmp_path / "records", controls=tmp_path / "controls", output=output)
-        return output.read_text(encoding="utf-8").replace("\\", "")
-
-    return make
-
-
 MISSED = r"\(50% of its stages missed the criterion\)"
 
 
@@ -38,6 +26,16 @@ def cells_of(text: str, start: str) -> list[str]:
     """Return the cells of the line of a table that begins with `start`."""
     (line,) = (line for line in text.splitlines() if line.startswith(start))
     return [cell.strip() for cell in line.strip("|").split(" | ")]
+
+
+@pytest.fixture
+def _tied(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let tuning have rated plain fine-tuning alike at the scenario's learning rate and at a tenth of it."""
+    tuned, tried = (resolve(f"clbench.runs.tuning:{name}") for name in ("Tuned", "Tried"))
+    rates = tuple(tried({"step_factor": factor}, 0.5, 0.9) for factor in (1.0, 0.1))
+    found = {"sft": tuned({"step_factor": 1.0}, rates)}
+    for module in ("certainty", "rows"):
+        monkeypatch.setattr(f"clbench.leaderboard.board.{module}.tuned", lambda scenario: found)
 
 
 def fill(even_board: Callable[..., Path], **kept: float) -> None:
@@ -54,7 +52,10 @@ def test_a_method_that_is_certainly_better_is_named_with_its_gain(
     text = page()
     # kept counts two skills and one earlier target of four tasks in all: a gain of 3/4 of the difference
     assert re.search(r"Without prior demonstrations: `finch` gains 0\.30 \[.*?\] on Even-v1\.", text)
-    assert "With prior demonstrations: no method is certainly better than tuned plain fine-tuning on" in text
+    assert "With prior demonstrations: no method is certainly better than plain fine-tuning on" in text
+    assert (
+        "## Does a method without prior demonstrations beat plain fine-tuning?\n" in text
+    )  # nothing is tuned
     assert "On Even-v1, yes: `finch` by 0.300 [" in text
     _, compared, largest, _, apart, alone = cells_of(text, "| Even-v1 | 3 methods")
     assert compared == "3 methods, 4 seeds"
@@ -91,40 +92,6 @@ def test_a_difference_that_is_certain_only_without_counting_the_comparisons_is_s
     assert "they are not corrected for the number of methods." in text
 
 
-@pytest.mark.long
-def test_the_ladder_tells_what_a_smaller_learning_rate_does(
-    even_board: Callable[..., Path], page: Callable[[], str]
-) -> None:
-    fill(even_board, sft=0.4)
-    assert "smaller learning rate" not in page()
-    for factor, kept in ((1.0, 0.2), (0.1, 0.5)):
-        for seed in range(4):
-            even_board("sft", seed, kept, "ladder", step_factor=factor)
-    text = page()
-    assert "On Even-v1, plain fine-tuning at 0.1 times the scenario's learning rate keeps 0.30 [" in text
-    assert "which is not certain" not in text
-    assert re.search(
-        r"\| plain fine-tuning at the scenario's learning rate \| 0\.20 \[.*?\], 4 seeds \|", text
-    )
-    assert re.search(
-        r"\| plain fine-tuning at its best rate \| 0\.50 \[.*?\], 4 seeds at factor 0\.1, best of 2 \|", text
-    )
-
-
-def test_a_smaller_learning_rate_that_keeps_more_by_chance_is_not_called_certain(
-    even_board: Callable[..., Path], page: Callable[[], str]
-) -> None:
-    fill(even_board, sft=0.4)
-    for factor, kept in ((1.0, (0.1, 0.5)), (0.1, (0.5, 0.3))):
-        for seed, share in enumerate(kept):
-            even_board("sft", seed, share, "ladder", step_factor=factor)
-    text = page()
-    found = re.search(r"keeps 0\.10 \[-0\.\d+, 0\.\d+\] more than at the scenario's learning rate(.*)", text)
-    assert found
-    assert found[1].startswith(", which is not certain, and learns 0.9")
-    assert "What a smaller rate gains is therefore biased upwards" in text
-
-
 @pytest.mark.parametrize("chances", [[], [0.01], [0.2, 0.03, 0.04, 0.01], [0.6, 0.02, 0.02, 0.5]])
 def test_a_corrected_p_is_that_of_holm(chances: list[float]) -> None:
     corrected = resolve("clbench.leaderboard.pages.agreements:holm")(chances)
@@ -149,13 +116,10 @@ def test_several_p_are_corrected_for_their_number(chances: list[float], says: st
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("_tied")
 def test_a_gain_that_is_not_certain_over_a_tied_setting_is_no_yes(
-    even_board: Callable[..., Path], page: Callable[[], str], monkeypatch: pytest.MonkeyPatch
+    even_board: Callable[..., Path], page: Callable[[], str]
 ) -> None:
-    tuning = resolve("clbench.runs.tuning:Tuned"), resolve("clbench.runs.tuning:Tried")
-    tried = tuple(tuning[1]({"step_factor": factor}, 0.5, 0.9) for factor in (1.0, 0.1))
-    found = {"sft": tuning[0]({"step_factor": 1.0}, tried)}
-    monkeypatch.setattr("clbench.leaderboard.board.certainty.tuned", lambda scenario: found)
     fill(even_board, sft=0.4, finch=0.8, lora=0.4)
     for seed in range(4):
         even_board("sft", seed, 0.8, "ladder", step_factor=0.1)
@@ -166,6 +130,31 @@ def test_a_gain_that_is_not_certain_over_a_tied_setting_is_no_yes(
         "but 0.000 [0.000, 0.000] at 0.1 times the scenario's learning rate, which scored the same in tuning "
         "(4 seeds)." in text
     )
+    assert re.search(r"`finch` 0\.300 \[.*?\] \(not over the tied setting; 50%", text)
+    assert "beat tuned fine-tuning?\n" in text
+
+
+@pytest.mark.usefixtures("_tied")
+def test_where_a_tied_setting_has_no_runs_the_page_says_why_no_gain_is_certain(
+    even_board: Callable[..., Path], page: Callable[[], str]
+) -> None:
+    fill(even_board, sft=0.4, finch=0.8, experience_replay=0.9)
+    keep_demonstrations(even_board("sft", 0, 0.4))
+    text = page()
+    why = (
+        "- On Even-v1, no gain is certain: for plain fine-tuning, 0.1 times the scenario's learning rate "
+        "scored the same in tuning, and the ladder beside these records has no runs of it"
+    )
+    for passage in ("## In short", "## What do prior demonstrations buy?"):
+        assert why in text.partition(passage)[2].partition("\n## ")[0]
+    assert re.search(r"`finch` 0\.300 \[.*?\] \(no runs at the tied setting; 50%", text)
+    assert cells_of(text, "| Even-v1 | `experience_replay`")[2].endswith("] (not certain)")
+
+
+def test_where_nothing_was_tuned_no_sentence_speaks_of_what_tuning_chose() -> None:
+    gain_text = resolve("clbench.leaderboard.views.format:gain_text")
+    text = gain_text("Even-v1", "`finch`", Estimate(0.1, -0.1, 0.3), ())
+    assert text.endswith("is not certain: it is 0.100 [-0.100, 0.300] over plain fine-tuning.")
 
 
 def judged(identifier: str, board: str, verdict: str, what: str, *sentences: str) -> Any:
@@ -271,8 +260,16 @@ def test_how_fast_lost_skills_come_back_is_told_with_their_names(
     assert unpretrained == (["20 (`skill_1` in 2)"] if other == "skill_1" else [])
 
 
+@pytest.mark.parametrize(
+    ("met", "words"),
+    [
+        (0, ", and never meets the criterion again."),
+        (1, ", and meets the criterion again in 1 of them; in 2, it never does."),
+        (2, " again after 8 steps on the skill's demonstrations in 2 of them; in 1, it never does."),
+    ],
+)
 def test_a_skill_that_does_not_come_back_is_said_to_be_gone(
-    make_record: Callable[..., Record], tmp_path: Path, page: Callable[[], str]
+    met: int, words: str, make_record: Callable[..., Record], tmp_path: Path, page: Callable[[], str]
 ) -> None:
     for seed in range(3):
         record = make_record(
@@ -282,12 +279,23 @@ def test_a_skill_that_does_not_come_back_is_said_to_be_gone(
             scenario="clbench/Even-v1",
             steps=(20,),
             ends=(8, 20),
-            relearning=Relearning("skill_1", 0, 20 if seed else 8, not seed),
+            relearning=Relearning("skill_1", 0, 8 if seed < met else 20, seed < met),
         )
         write_record(record, record_path(tmp_path / "records", "clbench/Even-v1", "sft", seed))
     text = page()
-    assert cells_of(text, "| Even-v1 | `skill_1`")[3] == "2 of 3 seeds"
+    (sentence,) = re.findall(r"On Even-v1, plain fine-tuning loses a skill in 3 of 3 seeds(.*)", text)
+    assert sentence.endswith(words)
+    assert cells_of(text, "| Even-v1 | `skill_1`")[3] == f"{3 - met} of 3 seeds"
     assert "If the policy never meets the criterion again, the full budget of a stage counts." in text
+
+
+def keep_demonstrations(records: Path) -> None:
+    """Let experience replay keep prior demonstrations between the stages of its records."""
+    for path in records.rglob("experience_replay/*.json"):
+        values = json.loads(path.read_text(encoding="utf-8"))
+        values["costs"]["bytes_kept"] = 1000
+        values["run"]["uses"]["demonstrations"] = "throughout"
+        path.write_text(json.dumps(sealed(values)), encoding="utf-8")
 
 
 @pytest.mark.long
@@ -298,12 +306,7 @@ def test_a_gain_of_replay_is_certain_only_if_the_test_tells_it_apart(
     for seed, luck in enumerate((0.02, -0.02, 0.06, -0.02)):
         even_board("sft", seed, 0.4)
         records = even_board("experience_replay", seed, kept + luck)
-    for path in records.rglob("*.json"):
-        values = json.loads(path.read_text(encoding="utf-8"))
-        if values["run"]["method"] != "sft":
-            values["costs"]["bytes_kept"] = 1000
-            values["run"]["uses"]["demonstrations"] = "throughout"
-        path.write_text(json.dumps(sealed(values)), encoding="utf-8")
+    keep_demonstrations(records)
     text = page()
     gain = cells_of(text, "| Even-v1 | `experience_replay`")[2]
     assert re.match(r"0\.\d+ \[0\.(?!00)", gain), "its own interval is above 0"
@@ -359,5 +362,62 @@ def test_without_records_at_equal_learning_there_is_nothing_to_say(
     output = tmp_path / "findings.md"
     findings(records=four_methods, controls=tmp_path / "controls", output=output)
     text = output.read_text(encoding="utf-8")
-    assert "beat tuned fine-tuning" not in text
+    assert "without prior demonstrations beat" not in text
     assert not (tmp_path / "findings").exists()
+
+
+def test_a_board_without_plain_fine_tuning_compares_nothing_with_it(
+    even_board: Callable[..., Path], page: Callable[[], str]
+) -> None:
+    fill(even_board, l2_sp=0.4)
+    text = page()
+    assert "plain fine-tuning on" not in text
+    assert "order the methods alike" not in text
+
+
+def test_boards_that_share_no_order_of_methods_are_not_compared(
+    even_board: Callable[..., Path],
+    make_record: Callable[..., Record],
+    tmp_path: Path,
+    page: Callable[[], str],
+) -> None:
+    fill(even_board, l2_sp=0.4)
+    for seed in range(4):
+        for method in ("sft", "l2_sp"):
+            one_target = [[1, 1, 0, 0], [0.5, 1, 0.9, 0]]
+            options = {"scenario": "clbench/Single-v1", "steps": (20,), "ends": (8,)}
+            record = make_record(one_target, method=method, seed=seed, **options)
+            write_record(record, record_path(tmp_path / "records", "clbench/Single-v1", method, seed))
+    text = page()
+    assert "On Single-v1, no method is above plain fine-tuning and told apart from it." in text
+    assert "Even-v1 and Single-v1" not in text
+
+
+def test_without_retained_skills_no_loss_of_skills_is_told(
+    make_record: Callable[..., Record], tmp_path: Path, page: Callable[[], str]
+) -> None:
+    for method, lost in (("sft", 10), ("frozen", 0)):
+        answers = {(stage, "left"): (50, 45 - stage * lost) for stage in range(3)}
+        for seed in range(2):
+            success = [[0, 0, 0], [0.9, 0, 0], [0.9, 0.9, 0]]
+            record = make_record(success, method=method, seed=seed, groups=(0, 2, 1), answers=answers)
+            write_record(record, record_path(tmp_path / "records", "clbench/Toy-v0", method, seed))
+    section = page().partition("## Are skills and knowledge lost together?")[2].partition("| scenario")[0]
+    said = "- Where stages have a fixed length, the share of correct answers falls by up to 0.40 (Toy-v0)."
+    assert section.strip() == said
+
+
+def test_a_single_seed_has_no_interval_in_any_section_and_picture(
+    even_board: Callable[..., Path], page: Callable[[], str]
+) -> None:
+    for method, kept in (("sft", 0.4), ("finch", 0.8), ("experience_replay", 0.9)):
+        records = even_board(method, 0, kept)
+    for factor in (1.0, 0.1):
+        even_board("sft", 0, 0.4, "ladder", step_factor=factor)
+    keep_demonstrations(records)
+    text = page()
+    assert cells_of(text, "| Even-v1 | 1 method, 1 seed")[2].startswith("`finch` 0.300 (50%")
+    assert not re.search(r"\d \[-?\d", text)
+    rows = resolve("clbench.leaderboard.board.rows:compute_board")(records).rows
+    (panel,) = resolve("clbench.leaderboard.pages.findings_charts:gains_chart")({"Even-v1": rows})["vconcat"]
+    assert all(one["low"] == one["value"] == one["high"] for one in panel["data"]["values"])

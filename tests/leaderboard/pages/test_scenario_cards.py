@@ -281,7 +281,25 @@ def test_where_nothing_draws_the_card_says_so_and_keeps_the_pictures_that_are_th
     assert "| left | - | go left" in card
     assert "![up](Toy-v0/up.webp)" in card
     assert kept.read_bytes() == before
-    assert "No pictures are drawn; existing ones are kept." in " ".join(capsys.readouterr().err.split())
+    assert "No pictures are drawn; existing ones are kept unless outdated." in " ".join(
+        capsys.readouterr().err.split()
+    )
+
+
+def test_a_picture_of_a_former_version_does_not_pass_for_one_of_the_present(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.card()
+    outdated, experts = (bench.output / "Toy-v0" / name for name in ("left.webp", "experts.json"))
+    values = json.loads(experts.read_text(encoding="utf-8"))
+    values["left"]["version"] = 7
+    experts.write_text(json.dumps(values), encoding="utf-8")
+    with monkeypatch.context() as without_renderer:
+        without_renderer.setattr("clbench.worlds.gl_backend.rendering_fault", lambda *_: "no display")
+        assert "Without a picture: left." in bench.card()
+    assert not outdated.exists()
+    assert "![left](Toy-v0/left.webp)" in bench.card()
+    assert outdated.exists()
 
 
 @pytest.mark.long
