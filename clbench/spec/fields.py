@@ -34,18 +34,21 @@ def whole_number(name: str, value: int, least: int) -> int:
 def check_whole(part: object, least: int, *fields: str, most: int | None = None) -> None:
     """Check that fields of `part` are whole numbers from `least` to `most`; None sets no upper bound.
 
+    A number of NumPy becomes a Python int, which JSON can hold.
+
     Raises:
         WrongTypeError: A field is not a whole number.
         InputError: A field is too small or too large.
     """
     for name in fields:
         value = getattr(part, name)
-        if not isinstance(value, int) or isinstance(value, bool):
+        if not is_whole(value):
             raise WrongTypeError(f"{_place(part, name)} must be a whole number, not {value!r}.")
         if value < least:
             raise InputError(f"{_place(part, name)} must be at least {least}, not {value}.")
         if most is not None and value > most:
             raise InputError(f"{_place(part, name)} must be at most {most}, not {value}.")
+        object.__setattr__(part, name, int(value))  # the part may be a frozen dataclass
 
 
 def check_positive(part: object, *fields: str) -> None:
@@ -57,8 +60,10 @@ def check_positive(part: object, *fields: str) -> None:
     """
     for name in fields:
         check_number(part, name)
-        if not 0 < getattr(part, name) < math.inf:
-            raise InputError(f"{_place(part, name)} must be above 0, not {getattr(part, name)}.")
+        value = getattr(part, name)
+        if not 0 < value < math.inf:
+            wanted = "finite" if value == math.inf else "above 0"
+            raise InputError(f"{_place(part, name)} must be {wanted}, not {value}.")
 
 
 def check_share(part: object, *fields: str) -> None:

@@ -23,7 +23,7 @@ LONGEST_LABEL = 200
 
 _IDENTIFIER = r"[A-Za-z_]\w*"
 _WORD = r"[A-Za-z0-9]\w*(?:[.-]\w+)*"
-_SCENARIO = re.compile(rf"[A-Za-z]\w*(?:-\w+)*/{_WORD}-v\d{{1,4}}", re.ASCII)
+_SCENARIO = re.compile(rf"[A-Za-z]\w*(?:-\w+)*/{_WORD}-v(?:0|[1-9]\d{{0,3}})", re.ASCII)
 _METHOD = re.compile(
     rf"[A-Za-z]\w*(?:-\w+)*|{_WORD}/[A-Za-z]\w*(?:[.-]\w+)*|{_IDENTIFIER}(?:\.{_IDENTIFIER})*:{_IDENTIFIER}",
     re.ASCII,

@@ -65,9 +65,7 @@ def _tokens() -> dict[int, str]:
 @cache
 def _tokenizer(length: int) -> Tokenizer:
     tokenizer = Tokenizer(models.WordPiece(_ids(), unk_token=PADDING))
-    tokenizer.normalizer = normalizers.Sequence(
-        [normalizers.NFKD(), normalizers.StripAccents(), normalizers.Lowercase()]
-    )
+    tokenizer.normalizer = _normalizer()
     tokenizer.pre_tokenizer = _splitter()
     tokenizer.enable_padding(length=length, pad_id=0, pad_token=PADDING)
     return tokenizer
@@ -129,9 +127,15 @@ def fitting_length(texts: tuple[str, ...]) -> int:
 
 
 def spelled_words(texts: Iterable[str]) -> list[str]:
-    """Return the words in `texts` that the vocabulary does not have, each once."""
-    words = (word for text in texts for word, _ in _splitter().pre_tokenize_str(text.lower()))
+    """Return the normalized words in `texts` that the vocabulary does not have, each once."""
+    read = map(_normalizer().normalize_str, texts)
+    words = (word for text in read for word, _ in _splitter().pre_tokenize_str(text))
     return [word for word in dict.fromkeys(words) if word not in vocabulary()]
+
+
+@cache
+def _normalizer() -> normalizers.Normalizer:
+    return normalizers.Sequence([normalizers.NFKD(), normalizers.StripAccents(), normalizers.Lowercase()])
 
 
 @cache
@@ -149,6 +153,6 @@ def word_id(word: str) -> int:
     """
     known = word.lower()
     if known not in vocabulary()[1:]:
-        hint = did_you_mean(known, vocabulary())
+        hint = did_you_mean(known, vocabulary()[1:])
         raise UnknownWordError(f"The word {word!r} is not in the vocabulary.{hint}")
     return vocabulary().index(known)

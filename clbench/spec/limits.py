@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from clbench.spec.fields import check_positive, check_whole
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -20,3 +22,7 @@ class Limits:
     written: int = 4 * 1024**3
     """Bytes that the process asks the system to write, wherever to: files, pipes or a terminal. Not measured
     on macOS, which does not count them."""
+
+    def __post_init__(self) -> None:
+        check_positive(self, "seconds")
+        check_whole(self, 1, "memory", "written")

@@ -9,7 +9,7 @@ import gymnasium
 from gymnasium.envs import registration
 
 from clbench.base.entry_points import import_module, is_entry_point, resolve
-from clbench.base.errors import InputError, UnknownNameError
+from clbench.base.errors import InputError, UnknownNameError, WrongTypeError
 from clbench.base.text import did_you_mean
 from clbench.spec.identifiers import check_scenario_id, unknown_scenario
 from clbench.spec.scenario import Scenario
@@ -99,11 +99,7 @@ def registered_scenario(scenario_id: str) -> Scenario:
         import_module(module, scenario_id)
     if name not in gymnasium.registry or "scenario" not in (gymnasium.registry[name].kwargs or {}):
         raise unknown_scenario(scenario_id)
-    entry_point = gymnasium.registry[name].kwargs["scenario"]
-    scenario = _scenario_at(entry_point)
-    if scenario.id != name:
-        raise UnknownNameError(f"{entry_point!r} is registered as {name!r}, but its id is {scenario.id!r}.")
-    return scenario
+    return _scenario_at(gymnasium.registry[name].kwargs["scenario"])
 
 
 def opened_scenario(scenario: Scenario | str, order: int = 0) -> Scenario:
@@ -114,26 +110,39 @@ def opened_scenario(scenario: Scenario | str, order: int = 0) -> Scenario:
         order: Number of the order, see `Scenario.in_order`.
 
     Raises:
-        UnknownNameError: The entry point leads to no scenario.
+        UnknownNameError: The entry point leads to no scenario, or is registered under another id.
+        WrongTypeError: It is neither a scenario nor an entry point.
         MissingPackageError: A package that the tasks need is not installed.
         InputError: There is no such order, or an instruction is too long or cannot be spelled.
     """
-    published = _scenario_at(scenario) if isinstance(scenario, str) else scenario
+    if not isinstance(scenario, Scenario | str):
+        raise WrongTypeError(f"A Scenario or its entry point 'module:name' is needed, not {scenario!r}.")
+    published = _scenario_at(scenario) if isinstance(scenario, str) else _spelled(scenario)
     published.require_packages()
     return published.in_order(order)
 
 
 def _scenario_at(entry_point: str) -> Scenario:
-    from clbench.spec.language import fitting_length  # the tokenizer, which registration does without
-
+    """Return the scenario at an entry point; every id that it is registered under must be its own."""
     scenario = resolve(entry_point)
     if not isinstance(scenario, Scenario):
         raise UnknownNameError(
             f"{entry_point!r} must be a Scenario, not an object of type {type(scenario).__name__}."
         )
-    instructions = tuple(
-        text for task in scenario.tasks for text in task.instructions + task.test_instructions
-    )
+    for name, spec in gymnasium.registry.items():
+        if name != scenario.id and (spec.kwargs or {}).get("scenario") == entry_point:
+            raise UnknownNameError(
+                f"{entry_point!r} is registered as {name!r}, but its id is {scenario.id!r}."
+            )
+    return _spelled(scenario)
+
+
+def _spelled(scenario: Scenario) -> Scenario:
+    """Return a scenario after a check that its instructions can be spelled."""
+    from clbench.spec.language import fitting_length  # the tokenizer, which registration does without
+
+    tasks = scenario.tasks + scenario.background
+    instructions = tuple(text for task in tasks for text in task.instructions + task.test_instructions)
     fitting_length(instructions)
     _warn_of_spelled_words(scenario.id, instructions)
     return scenario

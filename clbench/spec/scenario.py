@@ -13,7 +13,7 @@ from clbench.base.entry_points import resolve, unknown
 from clbench.base.errors import InputError, UnknownNameError, WrongTypeError
 from clbench.base.text import html_table, quoted
 from clbench.spec.budget import Budget
-from clbench.spec.fields import check_entry_point, check_tuple
+from clbench.spec.fields import check_entry_point, check_tuple, is_whole
 from clbench.spec.limits import Limits
 from clbench.spec.policies import DEFAULT_POLICY, check_policy_name
 from clbench.spec.task import Task
@@ -67,11 +67,17 @@ class Scenario:
                 value = quoted(repr(getattr(self, name)))
                 raise WrongTypeError(f"{name} of {self.id} must be a {kind.__name__}, not {value}.")
         names = [task.name for task in self.tasks + self.background]
+        folded = [name.replace("_", "-") for name in names]  # as in ids of datasets
         for name in names:
-            if names.count(name) > 1:
-                raise InputError(f"{self.id}: two tasks are called {name!r}.")
+            if folded.count(name.replace("_", "-")) > 1:
+                raise InputError(f"{self.id}: two tasks are called {name!r}; _ and - count as the same.")
         check_entry_point(self, "questions")
         check_policy_name(self.policy)
+        if not self.retained + self.target:
+            raise InputError(
+                f"{self.id}: a scenario needs retained or target tasks; held-out tasks and scenes alone make "
+                "no stage."
+            )
         if not self.scene_tasks:
             raise InputError(
                 f"{self.id}: a scenario without retained tasks needs scenes (tasks that give the states for "
@@ -231,9 +237,9 @@ def target_order(count: int, order: int) -> tuple[int, ...]:
     """
     # a stranger's long list of targets has a factorial of millions of digits; the factorial of 5 is enough
     last = min(math.factorial(min(count, 5)) - 1, MOST_ORDERS)
-    if not 0 <= order <= last:
+    if not is_whole(order) or not 0 <= order <= last:
         orders = f"orders 0 to {last}" if last else "order 0 alone"
-        raise InputError(f"{count} targets have {orders}, not {order}.")
+        raise InputError(f"{count} targets have {orders}, not {order!r}.")
     generator = random.Random(0)  # the only generator whose random() Python promises never to change
     found = {tuple(range(count)): None}
     while len(found) <= order:

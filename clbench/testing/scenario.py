@@ -31,6 +31,7 @@ from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 from clbench.worlds.lanes import Lanes
+from clbench.worlds.observation import Observer
 from clbench.worlds.world import World
 
 STILL = 3
@@ -51,6 +52,8 @@ def check_scenario(scenario: Scenario | str, *, episodes: int = 10, success: flo
     their space and rewards are numbers; the initial state depends on the seed; an episode depends only on the
     seed and the actions, also after other episodes, in a new world, and side by side in a vector world.
 
+    Cameras: each draws a first state, which needs a machine that can draw.
+
     Questions: all words are in the vocabulary, and every answer occurs in the experts' noisy episodes.
 
     Args:
@@ -61,6 +64,7 @@ def check_scenario(scenario: Scenario | str, *, episodes: int = 10, success: flo
     Raises:
         InputError: The number of episodes is not a whole number of at least 1.
         UnknownNameError: An entry point does not exist.
+        RenderingError: A camera cannot draw.
         ScenarioError: Any other part is wrong, or its code raises an error, which is then the cause.
     """
     if isinstance(scenario, str):
@@ -101,6 +105,8 @@ def check_scenario(scenario: Scenario | str, *, episodes: int = 10, success: flo
         raise ScenarioError(
             f"{scenario.id}: states and actions must have one size in all worlds, not {found}."
         )
+    for task in {task.world: task for task in tasks if task.camera}.values():  # all have the same camera
+        _check_camera(task)
     _check_questions(scenario, episodes)
 
 
@@ -168,6 +174,17 @@ def _check_task(task: Task, world: World, episodes: int, success: float) -> None
                 f"task {task.name}: the same seed and actions give a different episode {where}."
             )
     _check_side_by_side(task, seeds[:2], played[:2])
+
+
+def _check_camera(task: Task) -> None:
+    """Draw the first state of an episode: the observer refuses numbers and pictures of another size."""
+    with (
+        closing(resolve(task.world)()) as world,
+        closing(Observer(task.world, task.camera)) as observer,
+        _running(f"camera {task.camera}"),
+    ):
+        state, _ = world.reset(seed=0, options={"task": task.name})
+        observer.observe(state[None])
 
 
 def _aimless(world: World) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:

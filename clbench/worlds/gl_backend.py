@@ -20,7 +20,11 @@ _BACK_ENDS = tuple(DEBIAN_PACKAGES) if sys.platform == "linux" else ("glfw",)
 _DRAW = """
 import sys
 from clbench.base.entry_points import resolve
-world = resolve(sys.argv[1])(render_mode="rgb_array")
+thing = resolve(sys.argv[1])
+if hasattr(thing, "proprioception"):  # a camera, which is ready to draw once it is made
+    thing()
+    sys.exit()
+world = thing(render_mode="rgb_array")
 world.reset(seed=0)
 picture = world.render()
 world.close()
@@ -42,7 +46,8 @@ def rendering_fault(back_end: str, world: str | None = None) -> str | None:
 
     Args:
         back_end: Value for the variable `MUJOCO_GL`.
-        world: Entry point of an environment to draw; None only creates a rendering context.
+        world: Entry point of an environment to draw, or of a camera to make; None only creates a rendering
+            context.
     """
     command = [sys.executable, "-c", *((_MAKE_CONTEXT,) if world is None else (_DRAW, world))]
     try:
@@ -104,7 +109,7 @@ def working_back_end(worlds: Iterable[str], chosen: str | None) -> str:
     """Return the first back end that draws all worlds: EGL or OSMesa on Linux, GLFW elsewhere.
 
     Args:
-        worlds: Entry points of environments.
+        worlds: Entry points of environments or cameras.
         chosen: The user's value of `MUJOCO_GL`, the only back end to try; None or empty tries all.
 
     Raises:

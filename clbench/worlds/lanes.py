@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
+from typing import cast
 
 import gymnasium
 import numpy as np
@@ -17,7 +18,7 @@ from clbench.spec.task import Task
 from clbench.worlds.camera import VIEW_SIZE, Images
 from clbench.worlds.observation import Observer
 from clbench.worlds.perturbation import draw_perturbation
-from clbench.worlds.world import Outcomes, States, VectorWorld, World, checked_actions
+from clbench.worlds.world import Outcomes, Sizes, States, VectorWorld, World, check_sizes, checked_actions
 
 
 class PlainVectorWorld:
@@ -30,12 +31,8 @@ class PlainVectorWorld:
 
     def __init__(self, make: Callable[[], World], lanes: int) -> None:
         first = make()
-        assert isinstance(first.observation_space, spaces.Box)
-        assert isinstance(first.action_space, spaces.Box)
-        self.single_observation_space, self.single_action_space = (
-            first.observation_space,
-            first.action_space,
-        )
+        self.single_observation_space = cast(spaces.Box, first.observation_space)
+        self.single_action_space = cast(spaces.Box, first.action_space)
         self._make = make
         self._worlds: list[World | None] = [first, *[None] * (lanes - 1)]
 
@@ -132,15 +129,22 @@ class Lanes:
         """Number of lanes."""
         self._threads = threads
         self._worlds: dict[tuple[str, bool], VectorWorld] = {}
+        self._sizes: dict[Sizes, str] = {}
         self._observers: dict[tuple[str, str] | None, Observer] = {}
         self._home: list[VectorWorld | None] = [None] * count
         self._views = np.zeros((count, VIEW_SIZE), np.float32)
 
     def world(self, task: Task, perturbed: bool = False) -> VectorWorld:
-        """Return the vector world of a task, or its perturbed twin, which is made on first use."""
+        """Return the vector world of a task, or its perturbed twin, which is made on first use.
+
+        Raises:
+            InputError: Its states or actions differ in size from those of the other worlds.
+        """
         key = task.world, perturbed
         if key not in self._worlds:
-            self._worlds[key] = vector_world(task.world, self.count, self._threads, perturbed)
+            made = vector_world(task.world, self.count, self._threads, perturbed)
+            check_sizes(task.world, made.single_observation_space, made.single_action_space, self._sizes)
+            self._worlds[key] = made
         return self._worlds[key]
 
     def observer(self, task: Task) -> Observer:
@@ -197,7 +201,11 @@ class Lanes:
         return states
 
     def step(self, lanes: Sequence[int], actions: NDArray[np.float32]) -> Outcomes:
-        """Step each of `lanes`, none of them twice, with its row of the actions (N, A)."""
+        """Step each of `lanes`, none of them twice, with its row of the actions (N, A).
+
+        Raises:
+            InputError: An action is refused; no lane has moved.
+        """
         states, rewards, successes = (
             self._empty(lanes),
             np.empty(len(lanes)),
@@ -207,6 +215,8 @@ class Lanes:
             (world,) = self._worlds.values()
             states[:], rewards[:], successes[:] = world.step(lanes, actions)
             return states, rewards, successes
+        for world, rows in self._by_world(lanes):
+            checked_actions(actions[rows], world.single_action_space, "scenario's", len(rows))
         for world, rows in self._by_world(lanes):
             outcomes = world.step([lanes[row] for row in rows], actions[rows])
             states[rows], rewards[rows], successes[rows] = outcomes

@@ -28,12 +28,15 @@ from clbench.base.source import package_of, source_hash
 from clbench.spec.task import Task
 from clbench.worlds.camera import VIEW_SIZE, Camera, Images, Views, load_camera
 from clbench.worlds.gl_backend import RenderingError, environment_of, working_back_end
-from clbench.worlds.render_worker import HEADER
+from clbench.worlds.render_worker import END, HEADER
 from clbench.worlds.threads import cores
 from clbench.worlds.world import States
 
 TOGETHER = 256
 """Pictures per request to a drawing process: 3 MB of 64 x 64 pixels, and half a second of work."""
+
+_PATIENCE = 5.0
+"""Longest wait in seconds for a drawing process that was told to end; then it is killed."""
 
 
 class Observer:
@@ -92,9 +95,11 @@ class Observer:
         return numbers, self._draw(np.concatenate([views, states], axis=1, dtype=np.float32))
 
     def _draw(self, rows: States) -> Images:
+        if any(process.is_inherited for process in self._processes):
+            self.close()
         if not self._processes:
             assert self._entry_point is not None
-            back_end = _back_end(self._world, os.environ.get("MUJOCO_GL", ""))
+            back_end = _back_end(self._world, self._entry_point, os.environ.get("MUJOCO_GL", ""))
             self._processes = [
                 _DrawingProcess(self._entry_point, self.image_size, back_end) for _ in range(self._count)
             ]
@@ -120,11 +125,11 @@ class Observer:
 
 
 class _DrawingProcess:
-    """A process that draws: it reads views and states and writes pictures, until its input ends."""
+    """A process that draws: it reads views and states and writes pictures, until it is told to end."""
 
     def __init__(self, camera: str, image_size: int, back_end: str) -> None:
         self._camera, self._image_size = camera, image_size
-        self._asked = 0
+        self._asked, self._owner = 0, os.getpid()
         self._complaints = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the process
         self._process = subprocess.Popen(
             [sys.executable, "-m", "clbench.worlds.render_worker", camera],
@@ -134,6 +139,11 @@ class _DrawingProcess:
             # Mesa's own threads would fight for the cores with other runs, and take longer for small pictures
             env={**environment_of(back_end), "LP_NUM_THREADS": "0"},
         )
+
+    @property
+    def is_inherited(self) -> bool:
+        """Whether it draws for the process that this one was forked from."""
+        return self._owner != os.getpid()
 
     def ask(self, rows: States) -> None:
         """Send views and states (N, 4 + S), after waiting until the earlier ones are drawn."""
@@ -163,13 +173,20 @@ class _DrawingProcess:
         return RenderingError(f"The drawing process of {self._camera} has ended: {reason}")
 
     def close(self) -> None:
-        """End the process."""
+        """End the process, or if it is inherited, only close its files: the owner still needs it."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        with contextlib.suppress(BrokenPipeError):  # it has died with something unread
+        # it has died with something unread, or Ctrl-C interrupted an earlier close
+        with contextlib.suppress(BrokenPipeError, ValueError):
+            if not self.is_inherited:
+                self._process.stdin.write(END)
             self._process.stdin.close()
         self._process.stdout.close()
-        self._process.wait()
+        try:
+            self._process.wait(_PATIENCE)  # of an inherited process, it returns at once
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
         self._complaints.close()
 
     def __del__(self) -> None:
@@ -179,9 +196,15 @@ class _DrawingProcess:
 
 
 @functools.cache
-def _back_end(world: str, chosen: str) -> str:
-    """Return the back end that draws a world on this machine; the search takes seconds."""
-    return working_back_end([world], chosen)
+def _back_end(world: str, camera: str, chosen: str) -> str:
+    """Return the back end that draws a world on this machine; the search takes seconds.
+
+    Where none draws the world itself, which need not have a `render`, the camera alone is tried.
+    """
+    try:
+        return working_back_end([world], chosen)
+    except RenderingError:
+        return working_back_end([camera], chosen)
 
 
 def observed(task: Task, states: States) -> tuple[States, Images]:

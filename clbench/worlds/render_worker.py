@@ -18,9 +18,13 @@ from clbench.worlds.camera import VIEW_SIZE, Camera
 HEADER = struct.Struct("<II")
 """Number of rows, and numbers per row: first the view, then the state."""
 
+END = HEADER.pack(0, 0)
+"""Header that ends the process. Its input ends only when no process holds the other end of the pipe, and
+forked ones inherit it."""
+
 
 def main(entry_point: str) -> None:
-    """Draw the rows of numbers that follow each header on standard input, until the input ends.
+    """Draw the rows of numbers that follow each header on standard input, until `END` or the input's end.
 
     Args:
         entry_point: Entry point of the camera.
@@ -29,7 +33,7 @@ def main(entry_point: str) -> None:
     pictures = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     camera: Camera = resolve(entry_point)()
-    while header := sys.stdin.buffer.read(HEADER.size):
+    while (header := sys.stdin.buffer.read(HEADER.size)) not in (END, b""):
         count, size = HEADER.unpack(header)
         numbers = np.frombuffer(sys.stdin.buffer.read(4 * count * size), np.float32)
         views, states = np.split(numbers.reshape(count, size), [VIEW_SIZE], axis=1)

@@ -19,7 +19,7 @@ from clbench.worlds.gl_backend import draw_without_display
 from clbench.worlds.lanes import success_at_horizon
 from clbench.worlds.observation import Observer
 from clbench.worlds.schedule import InstructionFormat, Schedule, Start
-from clbench.worlds.world import World, checked_actions
+from clbench.worlds.world import Sizes, World, check_sizes, checked_actions
 
 Observation = dict[str, Any]
 
@@ -76,13 +76,15 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.scenario = opened_scenario(scenario, order)
         self.render_mode = render_mode
         self.instruction: InstructionFormat = instruction
-        self.stage, self.order = stage, order
+        self.order = int(order)
         self.steps_taken = 0
         """Steps since the environment was made."""
         self.begun_at: float | None = None
         """Start of the first episode in seconds, by `time.perf_counter`."""
         self._schedule = Schedule(self.scenario, episodes_per_stage, instruction, stage, task)
+        self.stage = self._schedule.stage
         self._worlds: dict[str, World] = {}
+        self._sizes: dict[Sizes, str] = {}
         self._observers: dict[str, Observer] = {}
         self._begun: Start | None = None
         self._steps, self._ended, self._at_horizon = 0, False, False
@@ -107,7 +109,9 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         if task.world not in self._worlds:
             # a world that cannot draw need not know the argument
             options = {} if self.render_mode is None else {"render_mode": self.render_mode}
-            self._worlds[task.world] = resolve(task.world)(**options)
+            world: World = resolve(task.world)(**options)
+            check_sizes(task.world, world.observation_space, world.action_space, self._sizes)
+            self._worlds[task.world] = world
             self._observers[task.world] = Observer(task.world, task.camera)
         return self._worlds[task.world]
 
@@ -120,14 +124,17 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             UnknownNameError: The scenario has no such task.
             InputError: The scenario has no such stage, or an option is unknown.
         """
+        self._schedule.check(options or {})  # a refused reset changes nothing
         super().reset(seed=seed)
         self.begun_at = self.begun_at or time.perf_counter()
         if seed is not None:
             self._schedule.begin()
-        self._begun = start = self._schedule.next(self.np_random, options or {})
-        self._steps, self._ended, self._at_horizon = 0, False, success_at_horizon(start.task)
+        start = self._schedule.next(self.np_random, options or {})
+        self._begun = None  # after an error of the world there is no episode
         world = self._world(start.task)
         state, _ = world.reset(seed=start.seed, options={"task": start.task.name})
+        self._begun = start
+        self._steps, self._ended, self._at_horizon = 0, False, success_at_horizon(start.task)
         self.metadata.update(_rate(world))  # in place: wrappers share the dictionary
         return self._observation(state), start.info(False)
 
@@ -135,14 +142,14 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def _start(self) -> Start:
         """Start of the current episode."""
         if self._begun is None:
-            raise gymnasium.error.ResetNeeded(f"{self.scenario.id} has no episode yet: call reset().")
+            raise gymnasium.error.ResetNeeded(f"{self.scenario.id} has no episode: call reset().")
         return self._begun
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Take one step of the current task.
 
         Raises:
-            ResetNeeded: There was no `reset` yet, or the episode has ended.
+            ResetNeeded: There was no `reset` yet, or none since `close`, or the episode has ended.
             InputError: The action has another shape than the action space, or a number in it is not finite.
         """
         task = self._start.task
@@ -176,6 +183,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             observer.close()
         self._worlds.clear()
         self._observers.clear()
+        self._begun = None
 
 
 def _rate(world: World) -> dict[str, Any]:

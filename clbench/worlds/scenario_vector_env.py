@@ -15,7 +15,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from clbench.base.errors import InputError, WrongTypeError
-from clbench.spec.fields import is_whole
+from clbench.spec.fields import check_whole, is_whole, whole_number
 from clbench.spec.registry import opened_scenario
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
@@ -49,6 +49,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         threads: Threads that step the worlds, by default one per core, at most one per environment.
             Results do not depend on their number.
         render_mode: None; environments side by side cannot be drawn.
+        max_episode_steps: None; an episode has the horizon of its task.
         autoreset_mode: When an environment whose episode has ended begins the next one. `NEXT_STEP` begins it
             at the next step, which ignores its action. `SAME_STEP` begins it at once; the infos then hold the
             last observation and info of the old episode, as `final_obs` and `final_info`. `DISABLED` leaves
@@ -72,6 +73,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         threads: int | None = None,
         render_mode: str | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        max_episode_steps: None = None,
     ) -> None:
         self._arguments = (
             *(scenario, num_envs, instruction, episodes_per_stage, stage, order, task, threads, render_mode),
@@ -82,14 +84,19 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
                 "This vector environment cannot be drawn. Draw a single environment with "
                 'gymnasium.make(...), or use gymnasium.make_vec(..., vectorization_mode="sync").'
             )
+        if max_episode_steps is not None:
+            raise InputError(
+                "This vector environment has no max_episode_steps: an episode has the horizon of its task. "
+                'gymnasium.make_vec(..., vectorization_mode="sync") cuts episodes off earlier.'
+            )
         self.scenario = opened_scenario(scenario, order)
-        if num_envs < 1:
-            raise InputError(f"num_envs must be at least 1, not {num_envs}.")
         self.num_envs = num_envs
+        check_whole(self, 1, "num_envs")
+        threads = cores() if threads is None else whole_number("threads", threads, 1)
         self.autoreset_mode = _mode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.instruction: InstructionFormat = instruction
-        self.stage, self.order = stage, order
+        self.order = int(order)
         self.steps_taken = 0
         """Steps of all environments together since they were made."""
         self.begun_at: float | None = None
@@ -98,8 +105,9 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
             Schedule(self.scenario, episodes_per_stage, instruction, stage, one)
             for one in _one_each(task, num_envs)
         ]
+        self.stage = self._schedules[0].stage
         self._generators = [np_random() for _ in range(num_envs)]
-        self._lanes = Lanes(num_envs, min(num_envs, threads or cores()))  # more would never get work
+        self._lanes = Lanes(num_envs, min(num_envs, threads))  # more would never get work
         first = self.scenario.tasks[0]
         world = self._lanes.world(first)
         shown = self._lanes.observer(first).spaces(world.single_observation_space)
@@ -153,13 +161,16 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
             InputError: The scenario has no such stage, an option is unknown, or the number of seeds is wrong.
             WrongTypeError: A seed is not a whole number.
         """
-        self.begun_at = self.begun_at or time.perf_counter()
         options = dict(options or {})
         numbers, seeds = self._chosen(options.pop("reset_mask", None)), self._seeds(seed)
         for number in numbers:
-            if (own := seeds[number]) is not None:
-                self._generators[number] = np_random(own)
-                self._schedules[number].begin()
+            self._schedules[number].check(options)  # a refused reset changes nothing
+        seeded = {number: np_random(own) for number in numbers if (own := seeds[number]) is not None}
+        for number, generator in seeded.items():
+            self._generators[number] = generator
+            self._schedules[number].begin()
+        self.begun_at = self.begun_at or time.perf_counter()
+        self.closed = False  # the worlds are made anew
         self._begin(numbers, options)
         self._ended[numbers] = False
         info: dict[str, Any] = {}
@@ -178,7 +189,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
                 f"True, not {mask!r}."
             )
         if not self._starts:
-            raise gymnasium.error.ResetNeeded(f"{self.scenario.id} has no episodes yet: first reset all.")
+            raise gymnasium.error.ResetNeeded(f"{self.scenario.id} has no episodes: first reset all.")
         return np.flatnonzero(mask).tolist()
 
     def _seeds(self, seed: Any) -> Sequence[int | None]:
@@ -197,11 +208,12 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         """Take one step in every environment; `autoreset_mode` decides when the next episode begins.
 
         Raises:
-            ResetNeeded: There was no `reset` yet, or without autoreset, an episode has ended.
+            ResetNeeded: There was no `reset` yet, or none since `close`, or without autoreset, an episode has
+                ended.
             InputError: There is not one action for each environment.
         """
         if not self._starts:
-            raise gymnasium.error.ResetNeeded(f"{self.scenario.id} has no episodes yet: call reset().")
+            raise gymnasium.error.ResetNeeded(f"{self.scenario.id} has no episodes: call reset().")
         actions, shape = np.asarray(actions), self.action_space.shape
         if actions.shape != shape:  # NumPy would repeat a single action
             raise InputError(
@@ -254,13 +266,15 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
     def close_extras(self, **kwargs: Any) -> None:
         """Close the worlds; Gymnasium's options of `close` change nothing here."""
         self._lanes.close()
+        self._starts = {}
 
     def _begin(self, numbers: Sequence[int], options: dict[str, Any]) -> None:
         """Begin the next episodes of the environments `numbers`, or those that the options choose."""
         starts = [self._schedules[number].next(self._generators[number][0], options) for number in numbers]
-        self._starts.update(zip(numbers, starts, strict=True))
+        before, self._starts = self._starts, {}  # after an error of a world there are no episodes
         tasks = [start.task for start in starts]
         self._states[numbers] = self._lanes.reset(numbers, [start.seed for start in starts], tasks)
+        self._starts = {**before, **dict(zip(numbers, starts, strict=True))}
         self._steps_left[numbers] = [task.horizon for task in tasks]
         self._tell()
 
@@ -301,7 +315,7 @@ def _one_each(task: str | Sequence[str] | None, count: int) -> Sequence[str | No
     Raises:
         InputError: There are more tasks than environments, or fewer.
     """
-    if task is None or isinstance(task, str):
+    if isinstance(task, str) or not np.iterable(task):
         return [task] * count
     if len(task) != count:
         raise InputError(f"{count} environments need as many tasks, or one for all, not {len(task)}.")

@@ -13,7 +13,7 @@ from gymnasium.error import CustomSpaceError
 from gymnasium.vector.utils import create_shared_memory
 
 from clbench.base.errors import InputError
-from clbench.spec.fields import is_whole
+from clbench.spec.fields import is_whole, whole_number
 from clbench.spec.language import VOCABULARY_SIZE, word_ids
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
@@ -83,19 +83,18 @@ class Schedule:
     ) -> None:
         if instruction not in ("text", "tokens"):
             raise InputError(f'instruction must be "text" or "tokens", not {instruction!r}.')
-        if not is_whole(episodes_per_stage) or episodes_per_stage < 1:
-            raise InputError(
-                f"episodes_per_stage must be a whole number, at least 1, not {episodes_per_stage!r}."
-            )
-        self._scenario, self._episodes_per_stage, self._format = scenario, episodes_per_stage, instruction
-        self._stage, self._task, self._episode = stage, task, -1
-        self._first = 0 if scenario.retained else 1
+        self._scenario, self._format = scenario, instruction
+        self._episodes_per_stage = whole_number("episodes_per_stage", episodes_per_stage, 1)
+        self.stage: int | None = None
+        """Stage that it never leaves."""
+        self._task: str | None = None
+        self._episode, self._first = -1, 0 if scenario.retained else 1
         if stage is not None and task is not None:
             raise InputError("Give stage or task, not both: a task determines its stage.")
         if stage is not None:
-            self._check_stage(stage)
+            self.stage = self._checked_stage(stage)
         if task is not None:
-            self._choose({})  # refuses an unknown name
+            self._task = self._checked_task(task).name
 
     @property
     def instruction_space(self) -> spaces.Space[Any]:
@@ -111,8 +110,8 @@ class Schedule:
         """Go back to the first episode."""
         self._episode = -1
 
-    def next(self, generator: np.random.Generator, options: Mapping[str, Any]) -> Start:
-        """Return the start of the next episode, or of the episode that `options` choose.
+    def check(self, options: Mapping[str, Any]) -> None:
+        """Refuse options that choose no episode, before anything changes.
 
         Raises:
             UnknownNameError: The scenario has no such task.
@@ -122,6 +121,13 @@ class Schedule:
             raise InputError(f'Options of reset are "task" and "stage", not {sorted(options)}.')
         if "task" in options and "stage" in options:
             raise InputError('Options of reset are "task" or "stage", not both: a task determines its stage.')
+        if "stage" in options:
+            self._checked_stage(options["stage"])
+        if "task" in options:
+            self._checked_task(options["task"])
+
+    def next(self, generator: np.random.Generator, options: Mapping[str, Any]) -> Start:
+        """Return the start of the next episode, or of the episode that checked `options` choose."""
         task, stage = self._choose(options)
         words = task.instructions[int(generator.integers(len(task.instructions)))]
         shown = shown_instruction(words, self._format, self._scenario)
@@ -131,29 +137,35 @@ class Schedule:
         """Return the task and the stage of the next episode."""
         scenario = self._scenario
         if "stage" in options:
-            self._check_stage(options["stage"])
-            self._episode = (options["stage"] - self._first) * self._episodes_per_stage
+            self._episode = (self._checked_stage(options["stage"]) - self._first) * self._episodes_per_stage
         elif "task" in options or self._task is not None:
-            name = options.get("task", self._task)
-            if not isinstance(name, str):
-                raise InputError(f'The option "task" must be a name, not {name!r}.')
-            task = scenario.task(name)
+            task = self._checked_task(options.get("task", self._task))
             return task, scenario.target.index(task) + 1 if task in scenario.target else 0
         else:
             self._episode += 1
         stage = min(self._first + self._episode // self._episodes_per_stage, len(scenario.target))
-        stage = stage if self._stage is None else self._stage
+        stage = stage if self.stage is None else self.stage
         retained = scenario.retained
         return scenario.target[stage - 1] if stage else retained[self._episode % len(retained)], stage
 
-    def _check_stage(self, stage: Any) -> None:
-        """Refuse a stage that the scenario does not have, or that this schedule never reaches."""
+    def _checked_task(self, name: Any) -> Task:
+        if not isinstance(name, str):
+            raise InputError(f'The option "task" must be a name, not {name!r}.')
+        return self._scenario.task(name)
+
+    def _checked_stage(self, stage: Any) -> int:
+        """Return a stage as a Python int: small ones of NumPy overflow when they are multiplied.
+
+        Raises:
+            InputError: The scenario does not have the stage, or this schedule never reaches it.
+        """
         last = len(self._scenario.target)
         if not is_whole(stage) or stage not in range(self._first, last + 1):
             raise InputError(f"{self._scenario.id} has stages {self._first} to {last}, not {stage!r}.")
-        if self._stage not in (None, stage) or self._task is not None:
-            home = f"in stage {self._stage}" if self._task is None else f"with the task {self._task!r}"
+        if self.stage not in (None, stage) or self._task is not None:
+            home = f"in stage {self.stage}" if self._task is None else f"with the task {self._task!r}"
             raise InputError(f"This environment stays {home}: make another for stage {stage}.")
+        return int(stage)
 
 
 def shown_instruction(words: str, form: InstructionFormat, scenario: Scenario) -> Any:

@@ -30,6 +30,8 @@ States: TypeAlias = NDArray[np.float32]
 """States of N lanes, (N, S)."""
 Outcomes: TypeAlias = tuple[States, NDArray[np.float64], NDArray[np.bool_]]
 """Result of a step in N lanes: states (N, S), rewards (N,), and whether each episode succeeded (N,)."""
+Sizes: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
+"""Shapes of a state and of an action of a world."""
 
 
 class VectorWorld(Protocol):
@@ -188,14 +190,42 @@ class MujocoWorld(OneLaneWorld):
             self._renderer = None
 
 
+def check_sizes(
+    world: str, states: spaces.Space[Any], actions: spaces.Space[Any], known: dict[Sizes, str]
+) -> None:
+    """Refuse a world whose states or actions differ in size from those of the scenario's other worlds.
+
+    Args:
+        world: Entry point of the world.
+        states: Its observation space.
+        actions: Its action space.
+        known: The sizes so far, each with the world that has them; those of this world are added.
+
+    Raises:
+        InputError: A space is not a Box, or has another shape than in the other worlds.
+    """
+    for kind, space in (("observation", states), ("action", actions)):
+        if not isinstance(space, spaces.Box):
+            raise InputError(f"The {kind} space of {world} must be a Box, not {space}.")
+    sizes = states.shape or (), actions.shape or ()
+    for others, other in known.items():
+        if others != sizes:
+            raise InputError(
+                f"All worlds of a scenario must have states and actions of the same shapes, but {other} has "
+                f"{others[0]} and {others[1]}, and {world} has {sizes[0]} and {sizes[1]}: fill the smaller "
+                "ones with zeros."
+            )
+    known.setdefault(sizes, world)
+
+
 def checked_actions(
     actions: NDArray[np.floating[Any]], space: spaces.Box, world: str, lanes: int
 ) -> NDArray[np.float32]:
     """Return actions (N, A) within the bounds of the action space of a world.
 
     Raises:
-        InputError: An action has another shape than the space, a number in it is not finite, or there is not
-            one action for each of the `lanes`.
+        InputError: An action has another shape than the space, does not consist of finite numbers, or there
+            is not one action for each of the `lanes`.
     """
     actions = np.asarray(actions)
     if actions.shape[1:] != space.shape:
@@ -206,6 +236,8 @@ def checked_actions(
         raise InputError(
             f"{lanes} lanes of the {world} world need one action each, not {len(actions)} in total."
         )
+    if actions.dtype.kind not in "fiub":
+        raise InputError(f"An action of the {world} world must be numbers, not {actions[0].tolist()}.")
     finite = np.isfinite(actions)
     if not finite.all():
         wrong = actions[~finite.all(axis=1)][0]

@@ -96,10 +96,10 @@ class MetaWorldVectorWorld:
     def _begin(self, lane: int, seed: int, task: str) -> State:
         perturbation = draw_perturbation(seed) if self._perturbed else None
         kind = task, perturbation.mass if perturbation else None
-        episode = self._idle[kind].pop() if self._idle[kind] else new_episode(*kind)
-        before = self._lanes[lane]
-        if before is not None:
+        before, self._lanes[lane] = self._lanes[lane], None
+        if before is not None:  # comes first: a task that begins again keeps its physics, and its renderer
             self._idle[before.kind].append(before.episode)
+        episode = self._idle[kind].pop() if self._idle[kind] else new_episode(*kind)
         self._lanes[lane] = _Lane(kind, episode)
         return episode.begin(seed, perturbation.start if perturbation else None)
 

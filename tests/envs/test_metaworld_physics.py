@@ -163,6 +163,16 @@ def test_a_lane_that_begins_another_task_leaves_its_place_to_others() -> None:
     np.testing.assert_array_equal(again, expected)
 
 
+def test_a_lane_that_begins_the_same_task_again_keeps_its_physics_and_so_its_renderer() -> None:
+    world: Any = metaworld(lanes=2)
+    world.reset([0, 1], [1, 2], ["drawer_open"] * 2)
+    physics = [world.drawable(lane).data for lane in range(2)]
+    for seed in (3, 4):
+        world.reset([0, 1], [seed, seed], ["drawer_open"] * 2)
+        assert [world.drawable(lane).data for lane in range(2)] == physics
+    world.close()
+
+
 @pytest.mark.parametrize("name", ["drawer_open", "faucet_close", "push_back"])
 def test_in_a_perturbed_episode_things_are_heavier_and_the_hand_elsewhere(name: str) -> None:
     worlds = [vector_world(WORLD, 1, 1, perturbed) for perturbed in (False, True)]

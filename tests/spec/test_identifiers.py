@@ -47,6 +47,12 @@ def test_scenarios_of_strangers_are_allowed(scenario: str) -> None:
     check_scenario_id(scenario)
 
 
+@pytest.mark.parametrize("scenario", ["me/X-v01", "me/X-v00", "me/X-v12345"])
+def test_a_version_that_gymnasium_writes_differently_is_refused(scenario: str) -> None:
+    with pytest.raises(ValueError, match="must be of the form namespace/Name-v0"):
+        check_scenario_id(scenario)
+
+
 @pytest.mark.parametrize(
     "name", ["", ".", "..", "a/b", "a\\b", "a b", "-a", ".a", "a.", "a--b", "a\n", "\u0430", "a" * 101]
 )

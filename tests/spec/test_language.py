@@ -76,6 +76,19 @@ def test_a_word_of_other_letters_is_named() -> None:
         encode(["push the block", "push the \u043a\u0443\u0431"])
 
 
+def test_a_word_is_looked_up_as_it_is_read_without_accents_and_ligatures() -> None:
+    assert spelled_words(["push the bl\u00f3ck", "\ufb01nd the Z\u00f3ning"]) == ["zoning"]
+    assert word_ids(["push the bl\u00f3ck"]) == word_ids(["push the block"])
+
+
+def test_the_padding_is_no_answer_and_is_not_proposed() -> None:
+    with pytest.raises(
+        UnknownWordError, match=r"The word '\[padding\]' is not in the vocabulary\."
+    ) as raised:
+        word_id("[padding]")
+    assert "Did you mean '[padding]'" not in str(raised.value)
+
+
 def test_an_answer_outside_the_vocabulary_is_named_with_the_nearest() -> None:
     with pytest.raises(UnknownWordError, match=r"The word 'blokc' is not .* Did you mean 'block'\?"):
         word_id("blokc")

@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium
 import pytest
 
+from clbench.spec.language import UnknownWordError
 from clbench.spec.registry import load_scenario, opened_scenario, register
 from clbench.spec.scenario import Scenario
 from clbench.testing import TOY
@@ -107,8 +108,31 @@ def test_an_id_that_nobody_registered_is_refused_with_what_was_probably_meant(
 
 def test_an_id_that_the_scenario_does_not_have_is_named() -> None:
     register("me/Other-v0", "strangers_module:MINE")
-    with pytest.raises(LookupError, match="registered as 'me/Other-v0', but its id is 'me/Mine-v0'"):
-        load_scenario("me/Other-v0")
+    for use in (load_scenario, gymnasium.make, gymnasium.make_vec):
+        with pytest.raises(LookupError, match="registered as 'me/Other-v0', but its id is 'me/Mine-v0'"):
+            use("me/Other-v0")
+
+
+@pytest.mark.parametrize("part", ["retained", "background"])
+@pytest.mark.parametrize("named", [True, False])
+def test_instructions_of_other_letters_are_refused_when_the_scenario_is_opened(
+    part: str, named: bool, module: types.ModuleType
+) -> None:
+    strange = (dataclasses.replace(TOY.retained[0], name="odd", instructions=("\u5de6",)),)
+    parts: dict[str, Any] = {part: strange}
+    scenario = dataclasses.replace(MINE, **parts)
+    vars(module).update(STRANGE=scenario)
+    with pytest.raises(UnknownWordError, match="cannot be spelled with English letters"):
+        opened_scenario("strangers_module:STRANGE" if named else scenario)
+
+
+def test_a_word_with_accents_that_the_vocabulary_has_without_them_gives_no_warning(
+    module: types.ModuleType, caplog: pytest.LogCaptureFixture
+) -> None:
+    accents = dataclasses.replace(MINE.target[0], instructions=("push the bl\u00f3ck",))
+    vars(module).update(ACCENTS=dataclasses.replace(MINE, target=(accents,)))
+    opened_scenario("strangers_module:ACCENTS")
+    assert not caplog.records
 
 
 def test_a_word_near_to_one_of_the_vocabulary_is_spelled_with_one_warning(
@@ -200,6 +224,18 @@ def test_a_scenario_of_other_parts_is_refused_where_it_is_built(
 def test_two_tasks_of_one_name_are_refused_where_the_scenario_is_built() -> None:
     with pytest.raises(ValueError, match="me/Mine-v0: two tasks are called 'left'"):
         Scenario("me/Mine-v0", "", TOY.retained, TOY.target, TOY.retained[:1], TOY.questions)
+
+
+def test_names_that_differ_in_dashes_alone_are_refused_as_their_demonstrations_would_be_the_same() -> None:
+    dashed = dataclasses.replace(TOY.target[0], name="up-left")
+    with pytest.raises(ValueError, match="two tasks are called 'up-left'; _ and - count as the same"):
+        dataclasses.replace(TOY, target=(dashed,))  # it holds out up_left
+
+
+@pytest.mark.parametrize("held_out", [TOY.held_out, ()])
+def test_a_scenario_without_a_stage_is_refused_where_it_is_built(held_out: Any) -> None:
+    with pytest.raises(ValueError, match="clbench/Toy-v0: a scenario needs retained or target tasks"):
+        dataclasses.replace(TOY, retained=(), target=(), held_out=held_out, scenes=TOY.retained)
 
 
 def test_tasks_with_different_observations_are_refused_where_the_scenario_is_built() -> None:

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import gymnasium
+import numpy as np
 import pytest
 from helpers import scenario_or_skip
 
@@ -12,6 +13,7 @@ from clbench.base.dependencies import require_packages
 from clbench.base.entry_points import resolve
 from clbench.spec.budget import Budget
 from clbench.spec.identifiers import scenario_ids
+from clbench.spec.limits import Limits
 from clbench.spec.registry import load_scenario, registered_scenario
 from clbench.spec.scenario import MOST_ORDERS, target_order
 
@@ -131,6 +133,7 @@ def test_a_budget_cannot_have_more_episodes_on_the_way_than_at_the_end() -> None
         ({"policy_width": 97}, ValueError, "Budget.policy_width must be a multiple of 4, .* not 97"),
         ({"noisy_demonstrations": 2}, ValueError, "Budget.noisy_demonstrations must be from 0 to 1, not 2"),
         ({"learning_rate": 0.0}, ValueError, "Budget.learning_rate must be above 0, not 0"),
+        ({"learning_rate": math.inf}, ValueError, "Budget.learning_rate must be finite, not inf"),
         ({"learning_rate": math.nan}, ValueError, "Budget.learning_rate must be above 0, not nan"),
         ({"learning_rate": "fast"}, TypeError, "Budget.learning_rate must be a number, not 'fast'"),
     ],
@@ -140,6 +143,27 @@ def test_an_impossible_budget_is_refused_where_it_is_built(
 ) -> None:
     with pytest.raises(error, match=message):
         Budget(**changes)
+
+
+def test_whole_numbers_of_numpy_become_pythons() -> None:
+    budget = Budget(demonstrations=np.int64(5))  # type: ignore[arg-type]
+    assert (budget.demonstrations, type(budget.demonstrations)) == (5, int)
+    assert budget == Budget(demonstrations=5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"seconds": -1}, ValueError, "Limits.seconds must be above 0, not -1"),
+        ({"memory": "x"}, TypeError, "Limits.memory must be a whole number, not 'x'"),
+        ({"written": 0}, ValueError, "Limits.written must be at least 1, not 0"),
+    ],
+)
+def test_impossible_limits_are_refused_where_they_are_built(
+    changes: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        Limits(**changes)
 
 
 @pytest.mark.parametrize(("count", "orders"), [(1, 1), (2, 2), (4, 24), (10, 1 + MOST_ORDERS)])

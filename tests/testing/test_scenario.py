@@ -14,6 +14,9 @@ from clbench.base.errors import InputError, UnknownNameError
 from clbench.data.questions import QuestionKind
 from clbench.spec.scenario import Scenario
 from clbench.testing import TOY, TOY_QUESTIONS, ScenarioError, ToyWorld, check_scenario, toy_expert
+from clbench.testing.seen_toy import SEEN_TOY
+from clbench.testing.toy_camera import ToyCamera
+from clbench.worlds.gl_backend import RenderingError
 from clbench.worlds.lanes import PlainVectorWorld
 
 HERE = f"{__name__}:"
@@ -272,6 +275,37 @@ def test_worlds_of_different_sizes_are_named() -> None:
         ScenarioError, match=r"one size in all worlds, not .*ToyWorld \(4, 2\), .*Wide \(5, 2\)"
     ):
         check_scenario(dataclasses.replace(TOY, held_out=(wide,)), episodes=3)
+
+
+class Small(ToyCamera):
+    """Its pictures are smaller than it says."""
+
+    def draw(self, states: Any, views: Any) -> Any:
+        return super().draw(states, views)[:, :8, :8]
+
+
+class Blurred(ToyCamera):
+    """It shows a policy no numbers."""
+
+    @staticmethod
+    def proprioception(states: Any) -> Any:
+        raise KeyError("gripper")
+
+
+@pytest.mark.parametrize(
+    ("camera", "error", "message"),
+    [
+        ("Small", RenderingError, r":Small has ended: .*draw\(\) must return \(1, 16, 16, 3\) of uint8, not"),
+        ("Blurred", ScenarioError, "camera .*:Blurred: KeyError: 'gripper'"),
+    ],
+)
+def test_a_camera_that_does_not_draw_is_named(camera: str, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        check_scenario(with_parts(camera=camera), episodes=3)
+
+
+def test_a_scenario_with_a_camera_passes() -> None:
+    check_scenario(SEEN_TOY, episodes=3)
 
 
 def test_a_missing_entry_point_is_named() -> None:

@@ -2,7 +2,9 @@
 
 import dataclasses
 import os
+import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,6 +26,7 @@ from clbench.learning.registry import method_names
 from clbench.learning.trainer import Trainer
 from clbench.policy.transformer import TransformerPolicy
 from clbench.spec.registry import load_scenario
+from clbench.testing import ToyWorld
 from clbench.testing.seen_toy import SEEN_TOY
 from clbench.testing.toy_camera import ToyCamera
 from clbench.worlds.camera import VIEW_SIZE, load_camera
@@ -311,3 +314,86 @@ def test_after_an_interruption_the_next_picture_is_that_of_its_own_state(
     _, images = observer.observe(states[1:])
     assert np.array_equal(images, expected[1:])
     observer.close()
+
+
+FORKED = """
+import os, signal, time
+import numpy as np
+from clbench.testing.seen_toy import SEEN_TOY
+from clbench.worlds import observation
+from clbench.worlds.observation import Observer
+
+observation.working_back_end = lambda *_: "egl"  # the toy draws by itself
+states = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 4)).astype(np.float32)
+observer = Observer(SEEN_TOY.target[0].world, SEEN_TOY.target[0].camera)
+_, expected = observer.observe(states)
+"""
+
+
+def _run_forked(code: str) -> None:
+    # a process of its own: pytest and its workers have threads
+    subprocess.run([sys.executable, "-W", "ignore", "-c", FORKED + code], check=True, timeout=100)
+
+
+def test_closing_does_not_wait_for_a_process_that_was_forked_after_the_first_picture() -> None:
+    _run_forked("""
+child = os.fork()
+if not child:
+    time.sleep(20)
+    os._exit(0)
+observer.close()
+assert os.waitpid(child, os.WNOHANG) == (0, 0), "it has ended first"
+os.kill(child, signal.SIGKILL)
+""")
+
+
+def test_a_forked_process_draws_its_own_states_even_while_the_first_one_waits_for_a_picture() -> None:
+    _run_forked("""
+Drawing = observation._DrawingProcess
+answer = Drawing.answer
+def fork_and_answer(process):
+    Drawing.answer = answer
+    child = os.fork()
+    if not child:
+        same = np.array_equal(observer.observe(states[1:])[1], expected[1:])
+        observer.close()
+        os._exit(0 if same else 1)
+    assert os.waitpid(child, 0)[1] == 0
+    return answer(process)
+Drawing.answer = fork_and_answer
+assert np.array_equal(observer.observe(states[:1])[1], expected[:1])
+assert np.array_equal(observer.observe(states)[1], expected)
+observer.close()
+""")
+
+
+def test_a_process_that_does_not_end_is_killed(
+    camera_of: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("clbench.worlds.observation._PATIENCE", 0.1)
+    camera = camera_of("    def draw(self, states, views): import time; time.sleep(20)\n")
+    observer = Observer(TASK.world, camera)
+
+    def interrupted(process: Any) -> Any:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("clbench.worlds.observation._DrawingProcess.answer", interrupted)
+    begun = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        observer.observe(_states(1))
+    assert time.monotonic() - begun < 15
+
+
+class Undrawn(ToyWorld):
+    """A world without a picture of its own."""
+
+    def render(self) -> Any:
+        raise NotImplementedError
+
+
+@pytest.mark.long
+def test_a_camera_draws_a_world_that_cannot_draw_itself() -> None:
+    observer, states = Observer(f"{__name__}:Undrawn", TASK.camera), _states(1)
+    _, images = observer.observe(states)
+    observer.close()
+    assert np.array_equal(images, ToyCamera().draw(states, np.zeros((1, VIEW_SIZE), np.float32)))

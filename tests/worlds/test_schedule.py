@@ -1,4 +1,4 @@
-"""The space of instructions as text, in Gymnasium's own vector environments and functions."""
+"""The schedule of episodes, and the space of instructions as text in Gymnasium's own vector environments."""
 
 import copy
 import pickle
@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
+
+from clbench.testing import TOY
+from clbench.worlds.scenario_env import ScenarioEnv
 
 
 def _async(**options: Any) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
@@ -50,3 +53,15 @@ def test_the_space_of_texts_is_equal_to_gymnasiums_own_and_so_are_its_copies(
     np.testing.assert_array_equal(spaces.flatten(space, text), spaces.flatten(plain, text))
     assert spaces.flatten_space(space) == spaces.flatten_space(plain)
     assert batch_space(space, 3) == batch_space(plain, 3)
+
+
+@pytest.mark.parametrize("kind", [np.int8, np.uint8, np.int64])
+def test_small_whole_numbers_of_numpy_choose_the_same_episodes_as_pythons(kind: Callable[[int], Any]) -> None:
+    for stage in (0, 2):
+        env = ScenarioEnv(TOY)
+        _, info = env.reset(seed=0, options={"stage": kind(stage)})
+        assert (info["stage"], type(info["stage"])) == (stage, int)
+        assert info["task"] == ("left", "right", "down")[stage]
+        assert type(ScenarioEnv(TOY, stage=kind(stage)).reset(seed=0)[1]["stage"]) is int
+    env = ScenarioEnv(TOY, episodes_per_stage=kind(100))
+    assert [env.reset()[1]["stage"] for _ in range(300)] == [0] * 100 + [1] * 100 + [2] * 100
