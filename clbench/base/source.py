@@ -11,6 +11,8 @@ Comments, docstrings and blank lines of Python files do not count: editing them 
 from __future__ import annotations
 
 import ast
+import dataclasses
+import enum
 import errno
 import functools
 import hashlib
@@ -20,7 +22,7 @@ import re
 import stat
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from types import CodeType, FunctionType
 
 DATA_SOURCES = ("clbench.base", "clbench.spec", "clbench.policy", "clbench.worlds", "clbench.data")
@@ -231,46 +233,61 @@ def class_hash(cls: type) -> str:
     return digest.hexdigest()[:16]
 
 
-def functions_behind(value: object) -> Iterator[FunctionType]:
+_CACHE = type(functools.cache(len))
+
+
+def functions_behind(value: object, inside: tuple[int, ...] = ()) -> Iterator[FunctionType]:
     """Yield the functions of an attribute of a class, from its outermost decorator to what is decorated.
 
-    The attribute may be a method, a property, or a function in a cache or with given arguments.
+    Args:
+        value: A function, a method, a property, or a function in a cache or with given arguments.
+        inside: Ids of the objects that hold it: a function may name itself as what it wraps.
     """
-    while value is not None and not isinstance(value, type):
-        if isinstance(value, FunctionType):
-            yield value
-        if isinstance(value, property):
-            value = value.fget
-        elif isinstance(value, functools.cached_property | functools.partialmethod | functools.partial):
-            value = value.func
-        else:
-            value = getattr(value, "__wrapped__", None)
+    if isinstance(value, FunctionType):
+        yield value
+    held: tuple[object, ...] = ()
+    if isinstance(value, property):
+        held = value.fget, value.fset, value.fdel
+    elif isinstance(value, functools.singledispatchmethod):
+        held = tuple(value.dispatcher.registry.values())
+    elif isinstance(value, functools.cached_property | functools.partialmethod | functools.partial):
+        held = (value.func,)
+    elif isinstance(value, FunctionType | staticmethod | classmethod | _CACHE):
+        held = (getattr(value, "__wrapped__", None),)
+    for one in held:
+        if id(one) not in (*inside, id(value)):
+            yield from functions_behind(one, (*inside, id(value)))
 
 
-def _text_of(value: object) -> str:
+def _text_of(value: object, inside: tuple[int, ...] = ()) -> str:
     """Return code or a plain value as text that is the same in each process, without line numbers.
 
-    Of other objects it is the type.
+    Args:
+        value: Of an object that is neither code nor a plain value, the text is its type.
+        inside: Ids of the objects that hold it: a list may hold itself.
     """
+    if id(value) in inside:
+        return "..."
+    text = functools.partial(_text_of, inside=(*inside, id(value)))
     if isinstance(value, CodeType):
-        return f"{value.co_code.hex()} {value.co_names} {_text_of(value.co_consts)}"
+        return f"{value.co_code.hex()} {value.co_names} {text(value.co_consts)}"
     if isinstance(value, FunctionType):
-        return _text_of((value.__code__, value.__defaults__, value.__kwdefaults__))
+        return text((value.__code__, value.__defaults__, value.__kwdefaults__))
     if isinstance(value, functools.partialmethod | functools.partial):
-        return _text_of((value.func, value.args, value.keywords))
-    if isinstance(value, dict):
-        return _text_of([*value.items()])
-    if isinstance(value, tuple | list):
-        return f"[{', '.join(map(_text_of, value))}]"
-    if isinstance(value, frozenset | set):  # it has another order in each process
-        return f"{sorted(map(_text_of, value))}"
+        return text((value.func, value.args, value.keywords))
     if isinstance(value, type):
         return value.__qualname__
-    return (
-        repr(value)
-        if isinstance(value, str | bytes | complex | float | int | None)
-        else type(value).__qualname__
-    )
+    if dataclasses.is_dataclass(value):
+        fields = {one.name: getattr(value, one.name, None) for one in dataclasses.fields(value)}
+        return f"{type(value).__qualname__} {text(fields)}"
+    if isinstance(value, dict):
+        return text([*value.items()])
+    if isinstance(value, tuple | list):
+        return f"[{', '.join(map(text, value))}]"
+    if isinstance(value, frozenset | set):  # it has another order in each process
+        return f"{sorted(map(text, value))}"
+    is_plain = isinstance(value, str | bytes | complex | float | int | enum.Enum | PurePath | None)
+    return repr(value) if is_plain else type(value).__qualname__
 
 
 def names_in(code: CodeType) -> set[str]:

@@ -126,15 +126,17 @@ def read_hdf5(path: Path, task: Task, state: Sequence[str] = ("states",)) -> lis
             f"{list(state)}."
         )
     _check_readable(path)
-    rate = control_rate(task)  # here: an error of the world is not one of the file
     with closing(resolve(task.world)()) as world:
         try:
             with h5py.File(path, "r") as file:
-                return _File(path, file, task, world, rate, state).demonstrations()
+                found = _File(path, file, task, world, state)
+                episodes = found.demonstrations()
         except InputError:  # a ValueError, too
             raise
         except _DAMAGE as error:
             raise InputError(f"{path} cannot be read as HDF5: it is damaged ({error}).") from error
+    found.check_rate()
+    return episodes
 
 
 def _check_readable(path: Path) -> None:
@@ -163,10 +165,9 @@ def _is_own_group(data: h5py.Group, name: str) -> bool:
 class _File:
     """An HDF5 file that is read for a task."""
 
-    def __init__(
-        self, path: Path, file: h5py.File, task: Task, world: World, rate: float | None, state: Sequence[str]
-    ) -> None:
-        self._path, self._file, self._task, self._rate, self._names = path, file, task, rate, tuple(state)
+    def __init__(self, path: Path, file: h5py.File, task: Task, world: World, state: Sequence[str]) -> None:
+        self._path, self._file, self._task, self._names = path, file, task, tuple(state)
+        self._rate: float | None = None
         self._states, self._actions = world.observation_space, world.action_space
         self._convert = getattr(getattr(world, "vector_world", None), "recorded_states", None)
 
@@ -196,7 +197,7 @@ class _File:
         return episodes
 
     def _check_attributes(self, data: h5py.Group) -> None:
-        """Check the instruction or the name of the task, and the control rate, where the file gives them."""
+        """Check the instruction or the name of the task, and read the control rate, where they are given."""
         words = _json(data.attrs.get("problem_info")).get("language_instruction") or []
         parts = words if isinstance(words, list) else [words]
         if not all(isinstance(part, str) for part in parts):
@@ -213,10 +214,12 @@ class _File:
             )
         kwargs = _json(data.attrs.get("env_args")).get("env_kwargs")
         rate = kwargs.get("control_freq") if isinstance(kwargs, dict) else None
-        if not isinstance(rate, int | float):
-            return
-        own = self._rate
-        if own is not None and not abs(rate - own) <= FARTHEST_RATE * own:  # also if it is NaN
+        self._rate = rate if isinstance(rate, int | float) else None
+
+    def check_rate(self) -> None:
+        """Check the control rate that the file gives, if any. The world must run, with errors of its own."""
+        rate, own = self._rate, None if self._rate is None else control_rate(self._task)
+        if rate is not None and own is not None and not abs(rate - own) <= FARTHEST_RATE * own:  # also if NaN
             raise self._error(
                 f"it was recorded at {rate:g} steps per second, but the world {self._task.world} makes "
                 f"{own:g}: each action would last a different time"
@@ -274,6 +277,11 @@ class _File:
             raise self._error(
                 f"{where}/states is neither a state of the world {self._task.world} nor one of its original: "
                 f"{error}"
+            ) from error
+        except Exception as error:  # else it would count as damage of the file
+            what = f"{type(error).__name__}: {error}"
+            raise self._error(
+                f"the world {self._task.world} cannot convert {where}/states ({what})"
             ) from error
         return converted
 

@@ -94,10 +94,10 @@ def read_changes(spec: str, cls: type[Method], changes: Mapping[str, Any]) -> di
     """
     try:
         hints = get_type_hints(cls)
-    except NameError as error:
+    except (NameError, AttributeError, SyntaxError, TypeError) as error:
         raise InputError(
-            f"{spec}: the type of a field cannot be read ({error}). Import the types of fields outside of "
-            "`if TYPE_CHECKING`."
+            f"{spec}: the type of a field cannot be read ({error}). It must have a meaning in the module "
+            "itself: a name that is imported under `if TYPE_CHECKING` has none."
         ) from error
     fields = [field.name for field in dataclasses.fields(cls)]
     values = {}

@@ -190,5 +190,6 @@ def evaluating(policy: Policy) -> Iterator[None]:
     try:
         yield
     finally:
+        policy.train(before[0][1])  # a module may do more in `train` than set its mode
         for module, training in before:
             module.training = training

@@ -6,6 +6,7 @@ read, write and send whatever that user can.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from clbench.spec.fields import check_positive, check_whole
@@ -16,7 +17,7 @@ class Limits:
     """Limits of a process and all processes that it starts. Our own runs need far less than the defaults."""
 
     seconds: float = 3600.0
-    """Time since its start, in seconds."""
+    """Time since its start, in seconds; `math.inf` for no limit."""
     memory: int = 8 * 1024**3
     """Resident memory at any one time, in bytes."""
     written: int = 4 * 1024**3
@@ -24,5 +25,6 @@ class Limits:
     on macOS, which does not count them."""
 
     def __post_init__(self) -> None:
-        check_positive(self, "seconds")
+        if self.seconds != math.inf:
+            check_positive(self, "seconds")
         check_whole(self, 1, "memory", "written")

@@ -16,6 +16,9 @@ from clbench.spec.scenario import Scenario
 
 LOG = logging.getLogger("clbench")
 
+ENVIRONMENT = "clbench.worlds.scenario_env:ScenarioEnv"
+"""Environment of every scenario."""
+
 
 def register(scenario_id: str, entry_point: str) -> None:
     """Register a scenario with Gymnasium, as a single environment and as a vector environment.
@@ -47,7 +50,7 @@ def register(scenario_id: str, entry_point: str) -> None:
     if known is None:
         registration.register(
             id=scenario_id,
-            entry_point="clbench.worlds.scenario_env:ScenarioEnv",
+            entry_point=ENVIRONMENT,
             vector_entry_point="clbench.worlds.scenario_vector_env:ScenarioVectorEnv",
             kwargs=kwargs,
         )
@@ -123,17 +126,21 @@ def opened_scenario(scenario: Scenario | str, order: int = 0) -> Scenario:
 
 
 def _scenario_at(entry_point: str) -> Scenario:
-    """Return the scenario at an entry point; every id that it is registered under must be its own."""
+    """Return the scenario at an entry point, which must be registered under its own id if under any."""
     scenario = resolve(entry_point)
     if not isinstance(scenario, Scenario):
         raise UnknownNameError(
             f"{entry_point!r} must be a Scenario, not an object of type {type(scenario).__name__}."
         )
-    for name, spec in gymnasium.registry.items():
-        if name != scenario.id and (spec.kwargs or {}).get("scenario") == entry_point:
-            raise UnknownNameError(
-                f"{entry_point!r} is registered as {name!r}, but its id is {scenario.id!r}."
-            )
+    names = [
+        name
+        for name, spec in gymnasium.registry.items()
+        if spec.entry_point == ENVIRONMENT and spec.kwargs.get("scenario") == entry_point
+    ]
+    if names and scenario.id not in names:
+        raise UnknownNameError(
+            f"{entry_point!r} is registered as {names[0]!r}, but its id is {scenario.id!r}."
+        )
     return _spelled(scenario)
 
 

@@ -67,10 +67,13 @@ class Scenario:
                 value = quoted(repr(getattr(self, name)))
                 raise WrongTypeError(f"{name} of {self.id} must be a {kind.__name__}, not {value}.")
         names = [task.name for task in self.tasks + self.background]
-        folded = [name.replace("_", "-") for name in names]  # as in ids of datasets
+        known: dict[str, str] = {}
         for name in names:
-            if folded.count(name.replace("_", "-")) > 1:
-                raise InputError(f"{self.id}: two tasks are called {name!r}; _ and - count as the same.")
+            other = known.setdefault(name.replace("_", "-"), name)  # as in ids of datasets
+            if names.count(name) > 1:
+                raise InputError(f"{self.id}: two tasks are called {name!r}.")
+            if other != name:
+                raise InputError(f"{self.id}: tasks cannot be called {other!r} and {name!r}: _ counts as -.")
         check_entry_point(self, "questions")
         check_policy_name(self.policy)
         if not self.retained + self.target:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Iterable
 from itertools import groupby
@@ -16,13 +17,14 @@ from .paths import CONTROLS, LADDER
 from .runs import Run
 
 
-def run_command(scenario: str, *labels: str, records: Path = RECORDS) -> str:
+def run_command(scenario: str, *labels: str, records: Path = RECORDS, controls: Path = CONTROLS) -> str:
     """Return the command that makes the records of `labels`, which all have the same changed settings.
 
     Args:
         scenario: Scenario as it was typed, with its module if it has one.
         labels: Methods with their settings. A label such as "sft@0.3" is a run of the ladder.
-        records: Folder of the records of the board.
+        records: Folder of the records of the board; the ladder is beside it.
+        controls: Folder of the other records with changed settings.
     """
     names = [label.partition("@")[0] for label in labels]
     methods = [name.partition("+")[0] for name in names]
@@ -30,7 +32,8 @@ def run_command(scenario: str, *labels: str, records: Path = RECORDS) -> str:
     factor = labels[0].partition("@")[2]
     changes += [(FACTOR, factor)] if factor else []
     settings = [f"--set.{name} {value}" for name, value in changes]
-    folder = (records.with_name(LADDER.name) if factor else CONTROLS) if changes else records
+    ladder = Path(os.path.normpath(records / ".." / LADDER.name))
+    folder = (ladder if factor else controls) if changes else records
     option = [] if folder == RECORDS else [f"--records {shlex.quote(folder.as_posix())}"]
     return " ".join(["clbench run", scenario, *methods, *settings, *option])
 

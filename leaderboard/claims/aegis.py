@@ -12,7 +12,7 @@ from typing import Any
 from clbench.base.text import counted
 from clbench.runs.tuning import tuned, tuned_scenarios
 from clbench.scoring.reading import is_number
-from clbench.spec.registry import load_scenario
+from clbench.spec.registry import registered_scenario
 
 from .claim import (
     ANYWHERE,
@@ -77,12 +77,13 @@ def action_loss_erodes_answers(evidence: Evidence) -> Finding:
     curve = answer_curve(evidence, "sft")
     steps, _ = learning_curve(evidence, "sft")
     half = [one for step, one in zip(steps, curve, strict=True) if step <= steps[-1] / 2]
+    looked = any(one.estimate.value is not None for one in half)
     sentences = _when_lost(evidence, "sft")
     if evidence.difference("question_retention", "stop_gradient", "sft").low > 0:
         sentences.append("Without this gradient in the backbone, less is lost, so the gradient is the cause.")
     verdict = decided(
         holds=any(figure.low > 0.01 for figure in half),
-        in_part=bool(half) and drop.low > 0.01,  # else nobody looked in the first half
+        in_part=looked and drop.low > 0.01,
         fails=drop.high < 0.01,
     )
     return Finding(
@@ -90,7 +91,9 @@ def action_loss_erodes_answers(evidence: Evidence) -> Finding:
         (drop, *curve),
         (stopped, *answer_curve(evidence, "stop_gradient")),
         tuple(sentences),
-        what_would_change(deciding(verdict, half, 0.01) if verdict == "holds" else drop, 0.01),
+        what_would_change(deciding(verdict, half, 0.01) if verdict == "holds" else drop, 0.01)
+        if looked or not drop.low > 0.01
+        else "Records that ask questions within the first half of the stage.",
     )
 
 
@@ -193,33 +196,37 @@ def lora_still_overwrites(evidence: Evidence) -> Finding:
         (
             *([f"{', '.join(less)}: fewer answers are lost than with sft."] if less else ()),
             "The direction of the update was not measured.",
-            *(f"{one}." for one in _not_tuned(evidence, "lora")),
+            *(f"{one}." for one, _ in _not_tuned(evidence, "lora")),
             *_when_lost(evidence, "lora"),
         ),
         what_would_change(*_deciding_rank(answers, skills)),
     )
 
 
-def _not_tuned(evidence: Evidence, method: str) -> list[str]:
-    """Return how the learning rate of a method that was not tuned compares with those of its tuned settings.
+def _not_tuned(evidence: Evidence, method: str) -> list[tuple[str, bool]]:
+    """Return how the learning rate of a method that was not tuned compares with those that tuning chose.
 
-    Empty if it was tuned on the scenario or on no other, or has no run.
+    The second value is whether it is higher than one of them. Empty if the method was tuned on the scenario,
+    or on no other, or has no run.
     """
     run = evidence.first_run(method)
-    elsewhere = [
-        load_scenario(name).budget.learning_rate * found.settings["step_factor"]
-        for name in tuned_scenarios()
-        if (found := tuned(name).get(method))
-    ]
-    of_scenario: Any = run.record.scenario.budget.get("learning_rate") if run else None
-    if run is None or not is_number(of_scenario) or not elsewhere or method in tuned(evidence.scenario):
+    rate: Any = run.record.scenario.budget.get("learning_rate") if run else None
+    if run is None or not is_number(rate) or method in tuned(evidence.scenario):
         return []
     factor: Any = run.record.run.settings.get("step_factor", SCENARIO_RATE)
-    rate = of_scenario * factor
-    return [
-        f"{method} was not tuned here: its learning rate is {rate / max(elsewhere):.0f} to "
-        f"{rate / min(elsewhere):.0f} times those that tuning chose elsewhere"
-    ]
+    ratios = sorted(
+        rate * factor / (registered_scenario(name).budget.learning_rate * found.settings["step_factor"])
+        for name in tuned_scenarios()
+        if (found := tuned(name).get(method))
+    )
+    if not ratios:
+        return []
+    least, most = (f"{one:.0f}" if one >= 10 else f"{one:.2g}" for one in (ratios[0], ratios[-1]))
+    times = least if least == most else f"{least} to {most}"
+    text = (
+        f"{method} was not tuned here: its learning rate is {times} times those that tuning chose elsewhere"
+    )
+    return [(text, ratios[-1] > 1)]
 
 
 def _deciding_rank(answers: Sequence[Figure], skills: Sequence[Figure]) -> tuple[Figure, float]:
@@ -263,8 +270,8 @@ def keeps_answers(evidence: Evidence) -> Finding:
         (sft, *gains, *answer_curve(evidence, "aegis")),
         (
             *(
-                f"{chosen}{one}. It may keep answers at smaller rates."
-                for one in _not_tuned(evidence, "aegis")
+                f"{chosen}{one}.{' It may keep answers at smaller rates.' if is_higher else ''}"
+                for one, is_higher in _not_tuned(evidence, "aegis")
             ),
             *_when_lost(evidence, "aegis"),
             *_near_the_anchor(anchor_ratio(evidence)),

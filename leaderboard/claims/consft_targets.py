@@ -98,7 +98,7 @@ def _what_keeps_targets(over_sft: Figure, over_controls: Sequence[Figure]) -> st
     if over_sft.low > 0 and missing and not reaching:
         return (
             "sft at its best learning rate certainly keeps fewer; whether weighing samples is the cause is "
-            f"not known without runs of {listed(missing)}."
+            f"not known without an interval for {listed(missing)}."
         )
     if over_sft.low > 0 and reaching:
         do = "does" if len(reaching) == 1 else "do"

@@ -28,12 +28,13 @@ CHECKS = {"replayed": "replayed {}", "retrained": "repeated {} as a whole"}
 """What another process did with the records of a tier."""
 
 
-def page(judged: Sequence[Judged], records: Path, *, published: bool) -> str:
+def page(judged: Sequence[Judged], records: Path, controls: Path, *, published: bool) -> str:
     """Return the page as Markdown.
 
     Args:
         judged: Findings on the claims.
         records: Folder of the records, which commands on the page name.
+        controls: Folder of the records with changed settings, likewise.
         published: Whether the records are the published ones: only then does the page tell how they came
             about.
     """
@@ -45,7 +46,7 @@ def page(judged: Sequence[Judged], records: Path, *, published: bool) -> str:
         verdicts=verdicts(judged),
         papers=grouped((claim.paper, (claim, members)) for claim, members in by_claim.items()).items(),
         not_used=list(refused.values()),
-        missing=partial(_missing, records),
+        missing=partial(_missing, records, controls),
         checked=_checked,
         published=published,
     )
@@ -71,14 +72,15 @@ def _corrected(here: Sequence[Judged]) -> str:
     return f"{first}; {later or 'none'} of the {counted(len(here), 'rule')} changed after it."
 
 
-def _missing(records: Path, one: Judged) -> list[str]:
-    """Return the commands that make what the figures of a finding lack in a folder of records."""
+def _missing(records: Path, controls: Path, one: Judged) -> list[str]:
+    """Return the commands that make what the figures of a finding lack in the folders of records."""
     figures = (*one.finding.figures, *one.finding.controls)
     labels = dict.fromkeys(label for figure in figures for label in figure.missing)
     plain = [label for label in labels if "+" not in label and "@" not in label]
     scenario = one.evidence.scenario
     groups = [plain, *([label] for label in labels if label not in plain)]
-    return [f"`{run_command(scenario, *group, records=records)}`." for group in groups if group]
+    commands = [run_command(scenario, *one, records=records, controls=controls) for one in groups if one]
+    return [f"`{command}`." for command in commands]
 
 
 def _checked(one: Judged) -> list[str]:

@@ -49,7 +49,7 @@ def claims(
     judged = judge_all(evidence, None if scenario is None else without_module(scenario))
     console = Console()
     console.print(terminal(judged))
-    _write({output: page(judged, records, published=_holds_published(records))})
+    _write({output: page(judged, records, controls, published=_holds_published(records))})
 
 
 def findings(

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 import torch
@@ -21,6 +22,7 @@ from clbench.base.source import (
     files_below,
     source_hash,
 )
+from clbench.learning.prior import Uses
 
 STAGES = {
     "demonstrations": (
@@ -389,6 +391,49 @@ def test_the_hash_of_a_typed_class_follows_its_code_and_values_and_not_its_place
         {"decorator": "staticmethod"},
     ):
         assert hashed(CLASS.format(**USUAL | change)) != before
+
+
+class _Answers:
+    """Has every attribute."""
+
+    def __getattr__(self, name: str) -> Any:
+        return self
+
+
+def _wraps_itself() -> None:
+    """Do nothing."""
+
+
+_wraps_itself.__wrapped__ = _wraps_itself  # type: ignore[attr-defined]
+_HOLDS_ITSELF: list[Any] = [1]
+_HOLDS_ITSELF.append(_HOLDS_ITSELF)
+
+
+@pytest.mark.parametrize("value", [_Answers(), _wraps_itself, _HOLDS_ITSELF, mock.call, mock.MagicMock()])
+def test_a_value_without_end_has_a_hash(value: Any) -> None:
+    assert len(class_hash(type("Some", (), {"value": value}))) == 16
+
+
+def _doubled(self: Any, value: Any) -> Any:
+    return 2 * value
+
+
+def _tripled(self: Any, value: Any) -> Any:
+    return 3 * value
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (Uses(demonstrations="prepare"), Uses(demonstrations="throughout")),
+        ((Path("a"), 1), (Path("b"), 1)),
+        (functools.singledispatchmethod(_doubled), functools.singledispatchmethod(_tripled)),
+        (property(fset=_doubled), property(fset=_tripled)),
+    ],
+)
+def test_the_hash_of_a_typed_class_follows_a_value_or_a_descriptor(one: Any, other: Any) -> None:
+    first, second = (class_hash(type("Some", (), {"value": value})) for value in (one, other))
+    assert first != second
 
 
 @pytest.mark.long

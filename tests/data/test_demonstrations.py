@@ -116,7 +116,6 @@ def test_an_empty_place_of_minari_is_no_folder_and_a_tilde_is_the_home(
     assert has_dataset(TASK, BUDGET)
 
 
-@pytest.mark.long
 def test_a_place_that_cannot_hold_datasets_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "file"))
@@ -124,6 +123,7 @@ def test_a_place_that_cannot_hold_datasets_is_named(tmp_path: Path, monkeypatch:
         dataset_folder(TASK, TOY.budget)
 
 
+@pytest.mark.long
 def test_every_kept_episode_succeeds_and_about_half_are_noisy() -> None:
     episodes = collect(load_scenario("clbench/Fetch-v1").task("press"), Budget(demonstrations=20))
     assert len(episodes) == 20

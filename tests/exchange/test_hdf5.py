@@ -323,7 +323,7 @@ def test_an_error_of_the_world_is_not_one_of_the_file(
     exported: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(toy_module, "Broken", _Broken, raising=False)
-    with pytest.raises(ValueError, match="^the scene has no table$"):
+    with pytest.raises(ValueError, match=r"^the scene has no table$"):
         read_hdf5(exported, dataclasses.replace(TASK, world="clbench.testing.toy:Broken"))
 
 

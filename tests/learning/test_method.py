@@ -155,9 +155,7 @@ def test_a_type_that_only_a_type_checker_knows_is_named(write_module: Callable[[
         "@dataclass\nclass Mine(Method):\n    scale: Factor = 1.0\n"
     )
     write_module("typed_module", text)
-    with pytest.raises(
-        InputError, match=r"typed_module:Mine: .*'Factor' is not defined\)\. Import the types"
-    ):
+    with pytest.raises(InputError, match=r"typed_module:Mine: .*'Factor' is not defined\)\. It must have"):
         build_method("typed_module:Mine", {})
 
 

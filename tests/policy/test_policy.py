@@ -341,15 +341,28 @@ def test_a_damaged_checkpoint_is_refused_by_name(
     assert str(tmp_path) in str(error.value)
 
 
+class Merging(nn.Linear):
+    """Merges its adapter while it is in evaluation mode, as those of some libraries do."""
+
+    merged = False
+
+    def train(self, mode: bool = True) -> "Merging":
+        self.merged = not mode
+        return super().train(mode)
+
+
 @pytest.mark.parametrize("training", [True, False])
 def test_a_policy_is_evaluated_without_dropout_and_then_as_it_was(training: bool) -> None:
-    policy = TransformerPolicy(CONFIG).train(training)
+    policy = TransformerPolicy(CONFIG)
+    policy.adapter = Merging(1, 1)
+    policy.train(training)
     policy.head.train(not training)  # a part may have a mode of its own
     before = [module.training for module in policy.modules()]
     with suppress(KeyError), evaluating(policy):
         assert not any(module.training for module in policy.modules())
         raise KeyError
     assert [module.training for module in policy.modules()] == before
+    assert policy.adapter.merged is not training
 
 
 # ---- images ------------------------------------------------------------------------------------------------
@@ -418,33 +431,3 @@ def test_a_checkpoint_keeps_the_eyes(tmp_path: Path) -> None:
     loaded = load_policy(tmp_path)
     assert loaded.config == SEEING
     assert loaded.action_loss(batch).equal(policy.action_loss(batch))
-
-
-@pytest.mark.parametrize(
-    "rows", [slice(1, 3), [2, 0], torch.tensor([False, True, True, False]), torch.tensor([3])]
-)
-def test_batches_can_be_indexed_and_joined_so_that_a_buffer_takes_few_lines(rows: Any) -> None:
-    def sample(count: int) -> Batch:
-        size = (count, 8, 2)
-        words = torch.randint(9, (count, 12))
-        return Batch(
-            torch.randn(count, 4),
-            words,
-            torch.randn(size),
-            torch.ones(size[:2]),
-            torch.rand(count),
-            torch.randn(size),
-        )
-
-    batch = sample(4)
-    chosen = batch[rows]
-    assert torch.equal(chosen.state, batch.state[rows])
-    assert torch.equal(chosen.noise, batch.noise[rows])
-    joined = Batch.cat([chosen, batch])
-    assert len(joined) == len(chosen) + 4
-    assert torch.equal(joined.words[len(chosen) :], batch.words)
-
-
-def test_a_batch_is_shown_in_one_line() -> None:
-    shapes = "state (2, 5), words (2, 12), action (2, 8, 3), valid (2, 8), draw (2,), noise (2, 8, 3)"
-    assert repr(_batch(4)[:2]) == f"<Batch of 2 samples: {shapes}>"

@@ -113,6 +113,14 @@ def test_an_id_that_the_scenario_does_not_have_is_named() -> None:
             use("me/Other-v0")
 
 
+def test_another_environment_with_the_same_scenario_does_not_take_its_name() -> None:
+    register("me/Mine-v0", "strangers_module:MINE")
+    register("me/Alias-v0", "strangers_module:MINE")
+    arguments = {"scenario": "strangers_module:MINE"}
+    gymnasium.register("me/Wrapped-v0", entry_point="lab.environments:Wrapped", kwargs=arguments)
+    assert load_scenario("me/Mine-v0").id == "me/Mine-v0"
+
+
 @pytest.mark.parametrize("part", ["retained", "background"])
 @pytest.mark.parametrize("named", [True, False])
 def test_instructions_of_other_letters_are_refused_when_the_scenario_is_opened(
@@ -228,7 +236,7 @@ def test_two_tasks_of_one_name_are_refused_where_the_scenario_is_built() -> None
 
 def test_names_that_differ_in_dashes_alone_are_refused_as_their_demonstrations_would_be_the_same() -> None:
     dashed = dataclasses.replace(TOY.target[0], name="up-left")
-    with pytest.raises(ValueError, match="two tasks are called 'up-left'; _ and - count as the same"):
+    with pytest.raises(ValueError, match="tasks cannot be called 'up-left' and 'up_left': _ counts as -"):
         dataclasses.replace(TOY, target=(dashed,))  # it holds out up_left
 
 

@@ -6,6 +6,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
+
 from clbench.base.entry_points import resolve
 
 commands_of = resolve("clbench.leaderboard.board.commands:commands_of")
@@ -46,6 +48,16 @@ def test_runs_that_were_made_in_another_way_have_a_command_of_their_own() -> Non
 def test_a_table_of_another_policy_names_it() -> None:
     (command,) = commands_of([_run(0, table="clbench/Toy-v0+discrete_diffusion")])
     assert command == "clbench run clbench/Toy-v0 lora --seeds 1 --policy discrete_diffusion"
+
+
+@pytest.mark.parametrize(
+    ("records", "ladder"), [("mine/records", "mine/ladder"), (".", "../ladder"), ("..", "../../ladder")]
+)
+def test_the_ladder_is_beside_the_folder_of_records(records: str, ladder: str) -> None:
+    command = run_command("clbench/Toy-v0", "sft@0.3", records=Path(records))
+    assert command.endswith(f"--records {ladder}")
+    changed = run_command("clbench/Toy-v0", "lora+rank=4", records=Path(records), controls=Path("others"))
+    assert changed.endswith("--set.rank 4 --records others")
 
 
 def test_changed_settings_and_rungs_of_the_ladder_go_to_their_own_folders() -> None:

@@ -165,6 +165,17 @@ def test_a_difference_of_a_metric_may_be_twice_as_large_as_the_metric(
     assert (found.low, found.high) == pytest.approx(expected)
 
 
+def test_methods_without_a_common_seed_have_no_difference_and_a_note_that_says_why(
+    bench: Bench, add: Callable[..., None]
+) -> None:
+    for method, seeds in (("sft", (0, 1)), ("consft", (2, 3))):
+        for seed in seeds:
+            add(method, seed, [[1, 1, 0, 0, 0], [1, 1, 1, 0, 0], [1, 1, 1, 1, 0]])
+    found = bench.evidence().difference("retention", "consft", "sft")
+    assert (found.estimate.value, found.seeds, found.missing) == (None, (), ())
+    assert found.note == "the methods have no seed in common"
+
+
 def test_a_preparation_is_a_share_of_all_steps(bench: Bench) -> None:
     bench.add("fast_dvla", costs={"optimiser_steps": 400, "preparation_steps": 100})
     assert bench.evidence().share_of_preparation("fast_dvla").value == 0.25
