@@ -129,6 +129,20 @@ def test_the_data_are_normalised_with_one_thread(monkeypatch: pytest.MonkeyPatch
     assert threads == [1]
 
 
+class Mute(TransformerPolicy):
+    """Answers no questions."""
+
+    abilities = frozenset()
+
+
+def test_a_watcher_sees_also_a_policy_that_has_nothing_to_learn() -> None:
+    toy = load_scenario("clbench.testing:clbench/Toy-v0")
+    untaught = dataclasses.replace(toy, retained=(), scenes=toy.target, policy=f"{__name__}:Mute")
+    steps: list[int] = []
+    pretrain(untaught, 0, watch=lambda policy, step: steps.append(step))
+    assert steps == [0]
+
+
 @pytest.mark.usefixtures("one_thread")
 def test_pretraining_repeats_itself_in_a_loop_written_out() -> None:
     toy = load_scenario("clbench.testing:clbench/Toy-v0")

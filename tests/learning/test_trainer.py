@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import importlib.metadata
 import math
 from typing import Any
 
@@ -14,7 +15,7 @@ from clbench.base.seeding import torch_generator
 from clbench.data.demonstrations import Demonstrations
 from clbench.learning.adaptation import Step
 from clbench.learning.method import Method, Progress
-from clbench.learning.trainer import Trainer
+from clbench.learning.trainer import Trainer, training_inputs
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -103,3 +104,7 @@ def test_the_step_factor_changes_the_scheduled_rate_and_not_the_one_that_a_metho
     trainer.learn(1, lambda step: rates.append(step.learning_rate))
     assert rates == [2e-4] * STEPS
     assert max(method.scheduled) == pytest.approx(0.5 * TINY.budget.learning_rate)
+
+
+def test_the_key_of_a_run_names_the_version_of_the_package_that_only_methods_use() -> None:
+    assert training_inputs(TINY, SEED)["versions"] == {"peft": importlib.metadata.version("peft")}

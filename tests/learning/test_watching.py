@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from tiny import TINY
 
 import clbench
@@ -15,6 +16,7 @@ from clbench.base.cache import cache_folder
 from clbench.base.progress import no_progress
 from clbench.learning.optimise import MethodError
 from clbench.learning.pretraining import pretrain
+from clbench.learning.trainer import Trainer
 from clbench.learning.watching import watch, watches
 from clbench.policy.transformer import TransformerPolicy
 from clbench.testing import ContractError, check_method
@@ -67,6 +69,14 @@ class Careful(clbench.Method):
 
 
 @dataclass
+class Drawing(Careful):
+    """Draws a number when it gets its state."""
+
+    def load_state(self, policy: clbench.Policy, state: dict[str, Any]) -> None:
+        self.drawn = float(torch.rand(()))
+
+
+@dataclass
 class Meddling(Careful):
     """Changes a weight on the way."""
 
@@ -99,6 +109,18 @@ def test_a_method_sees_every_step_and_pays_for_it(
     (state,) = (cache_folder() / "watched").glob("*/method.json")
     seen = {"step": steps, "steps": steps, "calls": steps + 1, "gradients": 1.0}
     assert json.loads(state.read_text(encoding="utf-8")) == seen
+
+
+def test_a_draw_after_the_pretraining_repeats_itself_and_moves_no_other() -> None:
+    drawn = set()
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        before = torch.get_rng_state()
+        trainer = Trainer.open(TINY, Drawing, 0, "cpu")
+        trainer.prepare()
+        assert torch.get_rng_state().equal(before)
+        drawn.add(trainer.method.drawn)  # type: ignore[attr-defined]
+    assert len(drawn) == 1
 
 
 @pytest.mark.usefixtures("empty_caches")
