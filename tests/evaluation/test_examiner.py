@@ -10,8 +10,8 @@ from eager import EAGER
 
 from clbench.data.questions import Questions, scored_questions
 from clbench.data.training_data import TrainingData
-from clbench.evaluation.episodes import Trial
-from clbench.evaluation.examiner import Examiner
+from clbench.evaluation.episodes import Episode, Trial
+from clbench.evaluation.examiner import Examiner, episode_row
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.method import Method, Stage
 from clbench.learning.pretraining import policy_config
@@ -22,7 +22,7 @@ from clbench.records.record import Record
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.scoring.scores import Scores
-from clbench.spec.protocol import ScoredSplit
+from clbench.spec.protocol import Point, ScoredSplit
 
 
 @dataclasses.dataclass
@@ -50,6 +50,11 @@ def test_a_policy_whose_hidden_states_overflow_has_no_drift_and_a_record_that_ca
     assert record.policy["activation_drift"][:-1].count(None) == 0
     assert record.policy["activation_drift"][-1] is None
     Scores.from_record(record)
+
+
+@pytest.mark.parametrize("total", [float("nan"), float("inf"), float("-inf")])
+def test_a_return_that_is_no_finite_number_is_recorded_as_missing(total: float) -> None:
+    assert episode_row(Point(1, 60), Episode("left", "test", 0, False, total, 12)).total_reward is None
 
 
 def _moments(policy: Policy, questions: Questions, count: int) -> list[tuple[torch.Tensor, torch.Tensor]]:

@@ -33,12 +33,19 @@ def test_a_torn_record_is_refused_wherever_it_is_torn(record: Record, tmp_path: 
 
 
 @pytest.mark.parametrize(
-    "content",
-    [b"[1, 2]", b"7", b"{}", b'{"schema": 0}', b'{"results": {"success": 1.0}}', b'{"schema": 3}'],
+    ("content", "words"),
+    [
+        (b"[1, 2]", "whole number from 1 to 5, found no object."),
+        (b"7", "whole number from 1 to 5, found no object."),
+        (b"{}", "whole number from 1 to 5, found none."),
+        (b'{"schema": 0}', "whole number from 1 to 5, found '0'."),
+        (b'{"results": {"success": 1.0}}', "whole number from 1 to 5, found none."),
+        (b'{"schema": 3}', "a record of schema 3: status, run, scenario, "),
+    ],
 )
-def test_foreign_json_is_refused(content: bytes, tmp_path: Path) -> None:
+def test_foreign_json_is_refused(content: bytes, words: str, tmp_path: Path) -> None:
     (tmp_path / "record.json").write_bytes(content)
-    with pytest.raises(RecordError, match="schema"):
+    with pytest.raises(RecordError, match=re.escape(words)):
         read_record(tmp_path / "record.json")
 
 

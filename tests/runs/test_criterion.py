@@ -29,6 +29,7 @@ from clbench.runs.length import run_length
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.runs.stages import keep_stage
+from clbench.runs.start import evaluate_pretrained
 from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
 from clbench.spec.protocol import Point, check_steps
@@ -192,16 +193,25 @@ class Hasty(Method):
         return policy.parameters()
 
 
+@dataclass
+class Lazily(Hasty):
+    """Does the same while its parameters are listed."""
+
+    def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
+        yield from super().start_task(policy, stage)
+
+
+@pytest.mark.parametrize("method", [Hasty, Lazily])
 def test_a_target_is_not_learned_before_the_steps_that_count(
-    tmp_path: Path, stranger: Callable[[type[Method]], str]
+    method: type[Method], tmp_path: Path, stranger: Callable[[type[Method]], str]
 ) -> None:
-    record = execute(RunSpec(EAGER.id, stranger(Hasty), seed=0), tmp_path)
+    record = execute(RunSpec(EAGER.id, stranger(method), seed=0), tmp_path)
     assert record.error is not None
     assert (
         "start_task() took 3 optimiser steps. With a criterion it must take none" in record.error["message"]
     )
     with pytest.raises(ContractError, match=r"no optimiser steps: a target is learned in the steps that"):
-        check_method(Hasty)
+        check_method(method)
 
 
 def test_each_seed_learns_the_targets_in_its_own_order(tmp_path: Path) -> None:
@@ -254,6 +264,28 @@ def test_a_record_with_a_criterion_reaches_every_tier(record: Record, tmp_path: 
         assert all(check.passed for check in checks), checks
     assert "ends of stages" in [check.name for check in checks]
     assert tiers.tier_of(spec.path(records)) == "retrained"
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("empty_caches")
+def test_all_episodes_around_a_run_have_its_seed_and_its_kept_policies_are_verified(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seeds, play = set[int](), Evaluator.play
+
+    def noted(self: Evaluator, *arguments: Any, **options: Any) -> Any:
+        seeds.add(self.seed)
+        return play(self, *arguments, **options)
+
+    monkeypatch.setattr(Evaluator, "play", noted)
+    spec, records = RunSpec(EAGER.id, "sft", seed=1), tmp_path / "records"
+    evaluate_pretrained(spec.resolve())
+    execute(spec, records, checkpoints=tmp_path / "kept")
+    for kept in (tmp_path / "kept", None):  # the second time they are trained again
+        request = subject.Request(tier="replayed", episodes=5, seed=7, checkpoints=kept)
+        found = verification.verify(spec.path(records), records, request)
+        assert all(check.passed for check in found), found
+    assert seeds == {1}
 
 
 @pytest.mark.long

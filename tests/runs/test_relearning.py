@@ -52,12 +52,17 @@ def velocity(policy: Policy, batch: Batch) -> torch.Tensor:
 
 
 @pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
 def test_the_shift_is_the_mean_squared_change_of_velocity_on_the_new_targets_data(
-    record: Record, policies: list[Policy], data: TrainingData
+    seed: int, record: Record, policies: list[Policy], data: TrainingData, tmp_path: Path
 ) -> None:
+    run = RunSpec(EAGER.id, "sft", seed).resolve()
+    if seed:
+        record = execute(run.spec, tmp_path / "records", checkpoints=tmp_path / "kept")
+        policies = stage_policies(run, tmp_path / "kept")
     assert record.policy["shift"][0] is None
-    for stage, task in enumerate(EAGER.target, 1):
-        batch = data.demonstrations(task).sample(256, torch_generator("shift", 0, stage))
+    for stage, task in enumerate(run.scenario.target, 1):
+        batch = data.demonstrations(task).sample(256, torch_generator("shift", seed, stage))
         change = velocity(policies[stage], batch) - velocity(policies[stage - 1], batch)
         samples = [
             sum(float(change[row, step].square().mean()) for step in valid.nonzero()) / int(valid.sum())

@@ -16,7 +16,8 @@ from torch import Tensor
 from clbench.base.cache import cache_folder, cached
 from clbench.base.lease import Lease
 from clbench.learning.method import Method
-from clbench.policy.policy import Policy
+from clbench.policy.policy import Policy, PolicyConfig
+from clbench.policy.transformer import TransformerPolicy
 from clbench.runs.length import run_length
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
@@ -79,6 +80,24 @@ def test_the_pretrained_policy_is_evaluated_once(tmp_path: Path, reports: Path) 
     assert starts[0] == starts[1]
     execute(RunSpec(TINY.id, "frozen", seed=0, perturb=True), tmp_path)
     assert len(list(reports.iterdir())) == 2  # a perturbed evaluation has more episodes
+
+
+class Fixed(TransformerPolicy):
+    """A policy that brings the same weights for every seed."""
+
+    pretrained = True
+
+    def __init__(self, config: PolicyConfig, seed: int = 0) -> None:
+        super().__init__(config, seed=0)
+
+
+@pytest.mark.long
+def test_seeds_that_start_from_the_same_weights_play_episodes_of_their_own(
+    tmp_path: Path, reports: Path
+) -> None:
+    for seed in range(2):
+        execute(RunSpec(TINY.id, "frozen", seed, policy=f"{__name__}:Fixed"), tmp_path)
+    assert len(list(reports.iterdir())) == 2
 
 
 @dataclasses.dataclass

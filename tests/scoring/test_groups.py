@@ -176,6 +176,14 @@ def test_the_error_of_episodes_is_the_standard_error_of_their_paired_differences
     assert alone["two"] == pytest.approx(1.95996 * np.sqrt(2 * (0.2**2 + of_episodes)), rel=1e-4)
 
 
+def test_the_deviation_assumed_for_one_seed_is_a_share_of_the_whole_range_of_the_metric() -> None:
+    rows = {"one": row(10), "two": row(10)}
+    final, forgetting = (
+        differences_needed(name, rows, "one")["two"] for name in ("final_average", "forgetting")
+    )
+    assert forgetting == pytest.approx(2 * final)  # its range is from -1 to 1
+
+
 def test_seeds_that_agree_by_chance_do_not_split_rows_that_differ_in_one_episode() -> None:
     rows = {
         "all": row(10, 10, 10),

@@ -87,6 +87,11 @@ def test_steps_to_the_criterion_count_a_stage_that_never_met_it_with_all_its_ste
     assert measure("speed", run, {"from_scratch": scratch}) == pytest.approx((100 / 8 * 25 / 1) ** 0.5)
 
 
+def test_no_step_counts_as_one_also_if_learning_from_scratch_took_none(scores: Callable[..., Scores]) -> None:
+    run, scratch = (scores(MATRIX, steps=(100,), ends=ends) for ends in ((8, 10), (0, 25)))
+    assert measure("speed", run, {"from_scratch": scratch}) == pytest.approx((1 / 8 * 25 / 10) ** 0.5)
+
+
 def test_a_run_that_learned_one_target_in_four_has_a_speed_and_one_that_learned_none_has_none(
     scores: Callable[..., Scores],
 ) -> None:

@@ -375,11 +375,17 @@ def test_what_only_the_end_of_a_targets_stage_has_is_refused_before(
         Scores.from_record(record, partial=True)
 
 
-@pytest.mark.parametrize("names", [None, "skill_0", [1], ["target_0"]])
-def test_a_scenario_without_clear_task_names_is_refused(names: Any, make_record: MakeRecord) -> None:
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        *((names, "retained must be a list of task names") for names in (None, "skill_0", [1])),
+        *((names, "a task name occurs twice") for names in (["target_0"], ["skill_0", "skill_0"])),
+    ],
+)
+def test_unclear_task_names_are_refused(names: Any, words: str, make_record: MakeRecord) -> None:
     record = make_record(MATRIX)
     record.scenario.retained = names
-    with pytest.raises(RecordError, match="scenario"):
+    with pytest.raises(RecordError, match=f"scenario: {words}"):
         Scores.from_record(record, partial=True)
 
 
@@ -437,8 +443,7 @@ def test_a_budget_of_fewer_than_no_episodes_is_refused(name: str, make_record: M
 
 
 def test_a_record_counts_the_steps_of_its_preparation(make_record: MakeRecord) -> None:
-    success = [[1, 0.8, 0.1, 0, 0.2], [0.6, 0.9, 0.9, 0.2, 0.3], [0.5, 0.4, 0.3, 0.8, 0.1]]
-    record = make_record(success, steps=(100,), ends=(8, 12))
+    record = make_record(MATRIX, steps=(100,), ends=(8, 12))
     record.costs = dataclasses.replace(record.costs, optimiser_steps=20, preparation_steps=300)
     with pytest.raises(RecordError, match="20 optimiser steps are fewer than the 320 of the preparation"):
         Scores.from_record(record, partial=True)

@@ -74,6 +74,15 @@ def test_with_rows_that_tie_the_chance_is_that_of_a_random_order_too() -> None:
     assert abs(found.chance - kendalltau(tied, other).pvalue) > 0.01  # SciPy's normal approximation
 
 
+def test_means_that_differ_in_the_last_bit_are_ties_of_the_chance() -> None:
+    tied, other = np.array([0.3, 0.3, 1.0, 2.0, 3.0, 4.0]), np.array([1.0, 0.0, 2.0, 3.0, 5.0, 4.0])
+    nearly = tied + np.eye(6)[0] * 4e-16
+    assert nearly[0] != nearly[1]
+    seeds = np.zeros((6, 4))
+    found = [agreement_between(one[:, None] + seeds, other[:, None] + seeds) for one in (tied, nearly)]
+    assert found[0].chance == found[1].chance
+
+
 def test_one_seed_of_a_board_shows_no_agreement() -> None:
     six = np.arange(6)[:, None] + np.zeros((6, 4))
     assert agreement_between(six, six[:, :3]) is None
@@ -91,13 +100,13 @@ def test_boards_whose_orders_have_nothing_in_common_rarely_agree() -> None:
     assert sum(one.direction != 0 for one in found) <= 16
 
 
-@pytest.mark.parametrize("shape", [(4, 8), (8, 3)])
+@pytest.mark.parametrize("shape", [(4, 8), (5, 8), (8, 3)])
 def test_few_rows_or_seeds_have_no_agreement(shape: tuple[int, int]) -> None:
     assert concordance(np.random.default_rng(0).random(shape)) is None
 
 
 def test_rows_of_one_value_have_no_agreement() -> None:
-    assert concordance(np.ones((5, 4))) is None
+    assert concordance(np.ones((6, 4))) is None
 
 
 def test_the_range_is_that_of_boards_whose_seeds_are_drawn_each_on_its_own() -> None:
@@ -123,6 +132,11 @@ def test_chance_is_excluded_below_one_in_twenty(chance: float, certain: bool) ->
         agreement = Agreement(tau, low, high, seeds=8, rows=6, chance=chance)
         assert agreement.direction == (np.sign(tau) if certain else 0)
     assert Agreement(0.5, -0.1, 0.9, seeds=8, rows=6, chance=chance).direction == 0
+
+
+@pytest.mark.parametrize(("tau", "low", "high"), [(0.5, 0.0, 0.9), (-0.5, -0.9, 0.0)])
+def test_a_range_that_ends_at_zero_has_no_direction(tau: float, low: float, high: float) -> None:
+    assert Agreement(tau, low, high, seeds=8, rows=6, chance=0.01).direction == 0
 
 
 def test_rows_that_differ_in_the_last_bit_alone_are_ties_of_a_seed() -> None:

@@ -1,5 +1,6 @@
 """Certainty of gains: over settings of fine-tuning that tuning rated as highly, and among many methods."""
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -51,6 +52,21 @@ def test_a_gain_over_a_tied_setting_is_that_over_plain_fine_tuning_there_on_comm
     differences = [3 / 4 * (0.6 - 0.2), 3 / 4 * (0.6 - 0.2), 3 / 4 * (0.7 - 0.5)]
     assert one.gain.value == pytest.approx(sum(differences) / 3)
     assert one.gain.low < one.gain.value < one.gain.high
+
+
+@pytest.mark.usefixtures("_tuned")
+def test_runs_of_the_ladder_on_another_scenario_change_no_tied_gain(even_board: Callable[..., Path]) -> None:
+    for seed in range(3):
+        records = even_board("lora", seed, 0.6)
+        even_board("sft", seed, 0.2, "ladder", step_factor=0.3)
+    runs = [read_run(records, path) for path in sorted(records.rglob("seed-*.json"))]
+    scores = {run.seed: run.scores for run in runs}
+    ladder, _ = read_ladder(ladder_of(records))
+    elsewhere = [
+        dataclasses.replace(run, table="clbench/Other-v0", scores=scores[run.seed]) for run in ladder
+    ]
+    (one,) = tied_gains(SCENARIO, {"lora": scores}, [*ladder, *elsewhere])["lora"]
+    assert one.gain.value == pytest.approx(3 / 4 * (0.6 - 0.2))
 
 
 @pytest.mark.usefixtures("_tuned")

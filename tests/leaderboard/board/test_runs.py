@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 from clbench.base.entry_points import resolve
-from clbench.records.paths import record_path
+from clbench.records.paths import label_of, record_path
+from clbench.records.reader import RecordError
 from clbench.records.record import Record
 from clbench.records.writer import write_record
 
@@ -51,3 +52,20 @@ def test_a_record_that_lacks_a_setting_had_its_default_and_not_what_tuning_chose
     assert [run.seed for run in kept] == [1, 2]
     (entry,) = refused
     assert entry.reason == "its settings do not match most seeds: step_factor differ."
+
+
+def test_a_changed_setting_that_the_settings_do_not_have_is_refused(
+    make_record: Callable[..., Record], tmp_path: Path
+) -> None:
+    changes = {"step_factor": 0.3}
+    record = make_record(
+        [[1.0, 0.0], [0.5, 1.0]],
+        groups=(1, 1, 0),
+        method="sft",
+        settings={"step_factor": 1.0},
+        changes=changes,
+    )
+    path = record_path(tmp_path, SCENARIO, label_of("sft", changes), 0)
+    write_record(record, path)
+    with pytest.raises(RecordError, match="run: changes and settings differ in step_factor"):
+        read_run(tmp_path, path, changed=True)

@@ -100,11 +100,15 @@ FORGERIES = {
     ),
     "an episode longer than its horizon": Forgery(
         "recomputed",
-        "ends of episodes: ",
+        "ends of episodes: failed before the horizon or ran beyond it: left test episode 0 of stage 0",
         lambda values: values["episodes"]["length"].__setitem__(0, 13),
     ),
-    "a success without a step": Forgery("recomputed", "ends of episodes: ", succeed_at_once),
-    "an episode counted twice": Forgery("recomputed", "record: ", repeat_row),
+    "a success without a step": Forgery(
+        "recomputed", "ends of episodes: failed before the horizon or ran beyond it: ", succeed_at_once
+    ),
+    "an episode counted twice": Forgery(
+        "recomputed", "record: episodes: an episode is there twice", repeat_row
+    ),
     "failures left out": Forgery(
         "recomputed",
         "episodes: there are none at stage 1",
@@ -112,7 +116,7 @@ FORGERIES = {
     ),
     "a task left out after the last stage": Forgery(
         "recomputed",
-        "episodes: ",
+        "record: episodes: the test episode 0 of left (and 2 others) is missing at stage 2",
         lambda values: keep(values, "episodes", lambda row: (row["stage"], row["task"]) != (2, "left")),
     ),
     "the curve left out": Forgery(
@@ -121,13 +125,19 @@ FORGERIES = {
         lambda values: keep(values, "episodes", lambda row: row["step"] in (0, 60)),
     ),
     "a column cut short": Forgery(
-        "recomputed", "record: ", lambda values: values["episodes"]["success"].pop()
+        "recomputed",
+        "the columns of episodes have different lengths",
+        lambda values: values["episodes"]["success"].pop(),
     ),
     "more correct answers than questions": Forgery(
-        "recomputed", "record: ", lambda values: values["answers"]["correct"].__setitem__(-1, 51)
+        "recomputed",
+        "record: answers: row 13 has impossible numbers",
+        lambda values: values["answers"]["correct"].__setitem__(-1, 51),
     ),
     "fewer questions than the budget asks": Forgery(
-        "recomputed", "record: ", lambda values: values["answers"]["asked"].__setitem__(-1, 40)
+        "recomputed",
+        "record: answers: at stage 2, step 60 other questions were asked than before any target",
+        lambda values: values["answers"]["asked"].__setitem__(-1, 40),
     ),
     "another simulator": Forgery(
         "recomputed",
@@ -141,14 +151,16 @@ FORGERIES = {
     ),
     "no definition": Forgery(
         "recomputed",
-        "record: ",
+        "a record of schema 5: fingerprint.definition must be an object",
         lambda values: values["fingerprint"].pop("definition"),
     ),
     "a larger budget": Forgery(
         "recomputed", "what was run: scenario.budget", set_in("scenario.budget", adaptation_steps=61)
     ),
     "an easier target": Forgery(
-        "recomputed", "record: ", lambda values: values["scenario"].update(target=["left", "down"])
+        "recomputed",
+        "record: scenario: a task name occurs twice",
+        lambda values: values["scenario"].update(target=["left", "down"]),
     ),
     "prior data that was not declared": Forgery(
         "recomputed", "record: run: uses do not match ", set_in("run.uses", demonstrations="throughout")
@@ -164,7 +176,9 @@ FORGERIES = {
         "recomputed", "record: run: uses do not match joint", set_in("run", method="joint")
     ),
     "validation episodes shown as test episodes": Forgery(
-        "recomputed", "", set_in("run", split="validation")
+        "recomputed",
+        "record: episodes: a tuning run has only validation episodes",
+        set_in("run", split="validation"),
     ),
     # ---- what the policies of the stages say
     "a success at the end of a stage": Forgery(

@@ -29,5 +29,6 @@ def test_a_point_of_a_curve_has_the_interval_of_its_mean_over_seeds(scores: Call
     runs = [scores([[kept, 0.0, 0.0], [kept, 1.0, 0.0]], steps=(100,)) for kept in values]
     found = estimated({"skills": retained_curve}, runs, np.random.default_rng(0))["skills"]
     ends = interval_of_seeds(0.5, float(stats.sem(values)), 2, (0.0, 1.0))
+    assert len(found) == 2  # before the first step, and at the only point
     for point in found:
         assert (point.value, point.low, point.high) == pytest.approx((0.5, *ends))
