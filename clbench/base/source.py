@@ -24,6 +24,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path, PurePath
 from types import CodeType, FunctionType
+from typing import Any
 
 DATA_SOURCES = ("clbench.base", "clbench.spec", "clbench.policy", "clbench.worlds", "clbench.data")
 """Code that demonstrations and questions depend on, besides the suite of their tasks."""
@@ -229,65 +230,84 @@ def class_hash(cls: type) -> str:
     for name, value in sorted(vars(cls).items()):
         functions = list(functions_behind(value))
         if functions or not name.startswith("__"):
-            digest.update(f"{name} {_text_of(functions)} {_text_of(value)}".encode())
+            try:
+                text = _text_of([*functions, value], {})
+            except RecursionError:  # a chain of hundreds of values
+                text = type(value).__qualname__
+            digest.update(f"{name} {text}".encode())
     return digest.hexdigest()[:16]
 
 
-_CACHE = type(functools.cache(len))
+def functions_behind(value: object) -> Iterator[FunctionType]:
+    """Yield the functions of an attribute of a class, with those that a descriptor or a decorator holds."""
+    todo, seen = [value], {}
+    while todo:
+        one = todo.pop()
+        if id(one) in seen:  # a function may name itself as what it wraps
+            continue
+        seen[id(one)] = one
+        if isinstance(one, FunctionType):
+            yield one
+        todo += _held_by(one)
 
 
-def functions_behind(value: object, inside: tuple[int, ...] = ()) -> Iterator[FunctionType]:
-    """Yield the functions of an attribute of a class, from its outermost decorator to what is decorated.
-
-    Args:
-        value: A function, a method, a property, or a function in a cache or with given arguments.
-        inside: Ids of the objects that hold it: a function may name itself as what it wraps.
-    """
-    if isinstance(value, FunctionType):
-        yield value
-    held: tuple[object, ...] = ()
+def _held_by(value: object) -> Sequence[object]:
     if isinstance(value, property):
-        held = value.fget, value.fset, value.fdel
-    elif isinstance(value, functools.singledispatchmethod):
-        held = tuple(value.dispatcher.registry.values())
-    elif isinstance(value, functools.cached_property | functools.partialmethod | functools.partial):
-        held = (value.func,)
-    elif isinstance(value, FunctionType | staticmethod | classmethod | _CACHE):
-        held = (getattr(value, "__wrapped__", None),)
-    for one in held:
-        if id(one) not in (*inside, id(value)):
-            yield from functions_behind(one, (*inside, id(value)))
+        return value.fget, value.fset, value.fdel
+    if isinstance(value, functools.singledispatchmethod):
+        return tuple(value.dispatcher.registry.values())
+    if isinstance(value, functools.cached_property | functools.partialmethod | functools.partial):
+        return (value.func,)
+    if isinstance(value, staticmethod | classmethod):
+        return (value.__func__,)
+    # not getattr: some objects have every attribute
+    return (_own(value).get("__wrapped__"),)
 
 
-def _text_of(value: object, inside: tuple[int, ...] = ()) -> str:
+def _own(value: object) -> dict[str, Any]:
+    """Return the attributes of an object of its own; none of a class, or of an object with slots."""
+    found = getattr(value, "__dict__", None)
+    return found if isinstance(found, dict) else {}
+
+
+def _text_of(value: object, seen: dict[int, object]) -> str:
     """Return code or a plain value as text that is the same in each process, without line numbers.
 
     Args:
         value: Of an object that is neither code nor a plain value, the text is its type.
-        inside: Ids of the objects that hold it: a list may hold itself.
+        seen: Parts of values so far, by id: each is told once, and one that holds itself has an end.
     """
-    if id(value) in inside:
-        return "..."
-    text = functools.partial(_text_of, inside=(*inside, id(value)))
-    if isinstance(value, CodeType):
-        return f"{value.co_code.hex()} {value.co_names} {text(value.co_consts)}"
-    if isinstance(value, FunctionType):
-        return text((value.__code__, value.__defaults__, value.__kwdefaults__))
-    if isinstance(value, functools.partialmethod | functools.partial):
-        return text((value.func, value.args, value.keywords))
+    if isinstance(value, enum.Enum):
+        return f"{type(value).__qualname__}.{value.name}"
+    for kind in (bool, int, float, complex, str, bytes):
+        if isinstance(value, kind):
+            return kind.__repr__(value)  # a subclass may have an address in its own
+    if value is None or isinstance(value, PurePath):
+        return str(value)
     if isinstance(value, type):
         return value.__qualname__
-    if dataclasses.is_dataclass(value):
-        fields = {one.name: getattr(value, one.name, None) for one in dataclasses.fields(value)}
-        return f"{type(value).__qualname__} {text(fields)}"
+    if id(value) in seen:
+        return f"#{list(seen).index(id(value))}"
+    parts = _parts_of(value)
+    seen[id(value)] = value, parts  # they stay alive, so that no other gets their ids
+    told = [_text_of(one, seen) for one in parts]
+    if isinstance(value, set | frozenset):  # it has another order in each process
+        told.sort()
+    return f"{type(value).__qualname__}[{', '.join(told)}]"
+
+
+def _parts_of(value: object) -> list[Any]:
+    if isinstance(value, CodeType):
+        return [value.co_code, value.co_names, value.co_consts]
+    if isinstance(value, FunctionType):
+        return [value.__code__, value.__defaults__, value.__kwdefaults__]
+    if isinstance(value, functools.partialmethod | functools.partial):
+        return [value.func, value.args, value.keywords]
     if isinstance(value, dict):
-        return text([*value.items()])
-    if isinstance(value, tuple | list):
-        return f"[{', '.join(map(text, value))}]"
-    if isinstance(value, frozenset | set):  # it has another order in each process
-        return f"{sorted(map(text, value))}"
-    is_plain = isinstance(value, str | bytes | complex | float | int | enum.Enum | PurePath | None)
-    return repr(value) if is_plain else type(value).__qualname__
+        return list(value.items())
+    if dataclasses.is_dataclass(value):
+        return [_own(value).get(one.name) for one in dataclasses.fields(value)]
+    return list(value) if isinstance(value, tuple | list | set | frozenset) else []
 
 
 def names_in(code: CodeType) -> set[str]:

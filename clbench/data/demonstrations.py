@@ -205,12 +205,11 @@ def keep_dataset(task: Task, budget: Budget, episodes: Callable[[World], Sequenc
     folder = minari_folder() / name
 
     def make(partial: Path) -> None:
+        _declare_namespaces(folder, name)
         with contextlib.closing(_world(task)) as world:
             _write_dataset(partial / "data", name, task, world, episodes(world))
 
-    cached(folder, dataset_inputs(task, budget), make)
-    _declare_namespaces(folder, name)
-    return folder
+    return cached(folder, dataset_inputs(task, budget), make)
 
 
 def has_dataset(task: Task, budget: Budget) -> bool:

@@ -214,7 +214,7 @@ class _File:
             )
         kwargs = _json(data.attrs.get("env_args")).get("env_kwargs")
         rate = kwargs.get("control_freq") if isinstance(kwargs, dict) else None
-        self._rate = rate if isinstance(rate, int | float) else None
+        self._rate = float(rate) if isinstance(rate, int | float) else None
 
     def check_rate(self) -> None:
         """Check the control rate that the file gives, if any. The world must run, with errors of its own."""
@@ -271,8 +271,9 @@ class _File:
         """Return the states as the world has them; it may convert the `states` in files of its original."""
         if self._convert is None or self._names != ("states",) or states.shape[1:] == self._states.shape:
             return states
+        model = group.attrs.get("model_file")
         try:
-            converted: NDArray[Any] = self._convert(self._task.name, states, group.attrs.get("model_file"))
+            converted: NDArray[Any] = self._convert(self._task.name, states, model)
         except InputError as error:
             raise self._error(
                 f"{where}/states is neither a state of the world {self._task.world} nor one of its original: "

@@ -190,6 +190,5 @@ def evaluating(policy: Policy) -> Iterator[None]:
     try:
         yield
     finally:
-        policy.train(before[0][1])  # a module may do more in `train` than set its mode
-        for module, training in before:
-            module.training = training
+        for module, training in before:  # first the whole, then its parts
+            module.train(training)

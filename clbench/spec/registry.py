@@ -102,7 +102,11 @@ def registered_scenario(scenario_id: str) -> Scenario:
         import_module(module, scenario_id)
     if name not in gymnasium.registry or "scenario" not in (gymnasium.registry[name].kwargs or {}):
         raise unknown_scenario(scenario_id)
-    return _scenario_at(gymnasium.registry[name].kwargs["scenario"])
+    entry_point = gymnasium.registry[name].kwargs["scenario"]
+    scenario = _scenario_at(entry_point)
+    if scenario.id != name:
+        raise _misnamed(entry_point, name, scenario)
+    return scenario
 
 
 def opened_scenario(scenario: Scenario | str, order: int = 0) -> Scenario:
@@ -138,10 +142,12 @@ def _scenario_at(entry_point: str) -> Scenario:
         if spec.entry_point == ENVIRONMENT and spec.kwargs.get("scenario") == entry_point
     ]
     if names and scenario.id not in names:
-        raise UnknownNameError(
-            f"{entry_point!r} is registered as {names[0]!r}, but its id is {scenario.id!r}."
-        )
+        raise _misnamed(entry_point, names[0], scenario)
     return _spelled(scenario)
+
+
+def _misnamed(entry_point: str, name: str, scenario: Scenario) -> UnknownNameError:
+    return UnknownNameError(f"{entry_point!r} is registered as {name!r}, but its id is {scenario.id!r}.")
 
 
 def _spelled(scenario: Scenario) -> Scenario:

@@ -223,10 +223,9 @@ def _not_tuned(evidence: Evidence, method: str) -> list[tuple[str, bool]]:
         return []
     least, most = (f"{one:.0f}" if one >= 10 else f"{one:.2g}" for one in (ratios[0], ratios[-1]))
     times = least if least == most else f"{least} to {most}"
-    text = (
-        f"{method} was not tuned here: its learning rate is {times} times those that tuning chose elsewhere"
-    )
-    return [(text, ratios[-1] > 1)]
+    how = "is one" if times == "1" else f"is {times} times those"
+    text = f"{method} was not tuned here: its learning rate {how} that tuning chose elsewhere"
+    return [(text, ratios[-1] > 1 + 1e-9)]
 
 
 def _deciding_rank(answers: Sequence[Figure], skills: Sequence[Figure]) -> tuple[Figure, float]:

@@ -187,7 +187,7 @@ def _go_on(subject: Subject, kept: Path, policies: Sequence[Policy]) -> Check:
     """Train a randomly chosen stage again from the kept policy before it, and compare with the one after it.
 
     Policies of another method that are passed off as this one's do not follow from each other. On another GPU
-    the last bits differ. A method whose own code moves weights without use far enough hides such policies.
+    the last bits differ. A method whose code moves unused weights far enough can hide such policies.
     """
     run = subject.resolved
     number = int(np.random.default_rng(subject.request.seed).integers(len(run.scenario.target))) + 1

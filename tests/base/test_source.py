@@ -1,5 +1,6 @@
 """Hashes of source code: a cache key covers all code of its stage, and every module it names exists."""
 
+import enum
 import errno
 import functools
 import importlib
@@ -407,11 +408,31 @@ def _wraps_itself() -> None:
 _wraps_itself.__wrapped__ = _wraps_itself  # type: ignore[attr-defined]
 _HOLDS_ITSELF: list[Any] = [1]
 _HOLDS_ITSELF.append(_HOLDS_ITSELF)
+_DOUBLED: list[Any] = [1]
+_CHAIN: list[Any] = [1]
+for _ in range(2000):
+    _DOUBLED, _CHAIN = ([_DOUBLED, _DOUBLED] if len(str(_)) < 3 else _DOUBLED), [_CHAIN]
 
 
-@pytest.mark.parametrize("value", [_Answers(), _wraps_itself, _HOLDS_ITSELF, mock.call, mock.MagicMock()])
+@pytest.mark.parametrize(
+    "value", [_Answers(), _wraps_itself, _HOLDS_ITSELF, _DOUBLED, _CHAIN, mock.call, mock.MagicMock()], ids=id
+)
 def test_a_value_without_end_has_a_hash(value: Any) -> None:
     assert len(class_hash(type("Some", (), {"value": value}))) == 16
+
+
+class Timed:
+    """Decorates a method, as an object that can be called."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        functools.update_wrapper(self, function)
+
+
+class Mode(enum.Enum):
+    """Is one of two choices."""
+
+    SLOW = frozenset("abcd")
+    FAST = frozenset("efgh")
 
 
 def _doubled(self: Any, value: Any) -> Any:
@@ -429,6 +450,8 @@ def _tripled(self: Any, value: Any) -> Any:
         ((Path("a"), 1), (Path("b"), 1)),
         (functools.singledispatchmethod(_doubled), functools.singledispatchmethod(_tripled)),
         (property(fset=_doubled), property(fset=_tripled)),
+        (Timed(_doubled), Timed(_tripled)),
+        (Mode.SLOW, Mode.FAST),
     ],
 )
 def test_the_hash_of_a_typed_class_follows_a_value_or_a_descriptor(one: Any, other: Any) -> None:

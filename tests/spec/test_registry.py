@@ -119,6 +119,8 @@ def test_another_environment_with_the_same_scenario_does_not_take_its_name() -> 
     arguments = {"scenario": "strangers_module:MINE"}
     gymnasium.register("me/Wrapped-v0", entry_point="lab.environments:Wrapped", kwargs=arguments)
     assert load_scenario("me/Mine-v0").id == "me/Mine-v0"
+    with pytest.raises(LookupError, match="registered as 'me/Alias-v0', but its id is 'me/Mine-v0'"):
+        load_scenario("me/Alias-v0")
 
 
 @pytest.mark.parametrize("part", ["retained", "background"])

@@ -6,6 +6,8 @@ from claims_bench import Bench
 from clbench.records.record import Record
 from clbench.runs.tuning import tuned
 
+AEGIS = "clbench.leaderboard.claims.aegis"
+
 
 def test_the_learning_rate_of_a_method_that_was_not_tuned_is_compared_with_tuned_ones(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
@@ -24,7 +26,7 @@ def test_the_learning_rate_of_a_method_that_was_not_tuned_is_compared_with_tuned
         "It may keep answers at smaller rates.",
     ]
     everywhere = {name: tuned("clbench/Fetch-v1")[name] for name in ("lora", "aegis")}
-    monkeypatch.setattr("clbench.leaderboard.claims.aegis.tuned", lambda table: everywhere)
+    monkeypatch.setattr(f"{AEGIS}.tuned", lambda table: everywhere)
     tuned_here = [one for name in ("A3", "A4") for one in bench.judge(name).sentences]
     assert not any("not tuned" in one for one in tuned_here)
 
@@ -35,3 +37,32 @@ def test_a_learning_rate_is_compared_where_the_packages_of_tuned_scenarios_are_m
     bench.add("lora")
     monkeypatch.setattr("clbench.base.dependencies.is_installed", lambda package: False)
     assert bench.judge("A3").verdict == "undecided"
+
+
+@pytest.mark.parametrize(
+    ("factor", "says"),
+    [
+        (0.1, "its learning rate is one that tuning chose elsewhere."),
+        (0.05, "its learning rate is 0.5 times those that tuning chose elsewhere."),
+        (
+            0.33,
+            "its learning rate is 3.3 times those that tuning chose elsewhere. It may keep answers at",
+        ),
+    ],
+)
+def test_only_a_higher_learning_rate_is_said_to_leave_room_below(
+    factor: float, says: str, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def at_a_rate(record: Record) -> None:
+        record.scenario.budget["learning_rate"] = 3e-4 * factor
+
+    tuned_there = tuned("clbench/Fetch-v1")["lora"]  # a tenth of 3e-4
+    monkeypatch.setattr(f"{AEGIS}.tuned_scenarios", lambda: ["clbench/Fetch-v1"])
+    monkeypatch.setattr(
+        f"{AEGIS}.tuned", lambda table: {"aegis": tuned_there} if table == "clbench/Fetch-v1" else {}
+    )
+    for method in ("sft", "frozen", "aegis"):
+        bench.add(method, right=(500, 400), edit=at_a_rate)
+    (said,) = (one for one in bench.judge("A4").sentences if "not tuned" in one)
+    assert says in said
+    assert ("It may keep" in said) is ("It may keep" in says)
