@@ -425,7 +425,7 @@ class Timed:
     """Decorates a method, as an object that can be called."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        functools.update_wrapper(self, function)
+        functools.update_wrapper(self, function)  # type: ignore[arg-type]
 
 
 class Mode(enum.Enum):
