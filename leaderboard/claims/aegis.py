@@ -221,7 +221,7 @@ def _not_tuned(evidence: Evidence, method: str) -> list[tuple[str, bool]]:
     )
     if not ratios:
         return []
-    least, most = (f"{one:.0f}" if one >= 10 else f"{one:.2g}" for one in (ratios[0], ratios[-1]))
+    least, most = (f"{one:.0f}" if one >= 1 else f"{one:.2g}" for one in (ratios[0], ratios[-1]))
     times = least if least == most else f"{least} to {most}"
     how = "is one" if times == "1" else f"is {times} times those"
     text = f"{method} was not tuned here: its learning rate {how} that tuning chose elsewhere"

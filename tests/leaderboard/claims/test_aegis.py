@@ -46,7 +46,7 @@ def test_a_learning_rate_is_compared_where_the_packages_of_tuned_scenarios_are_m
         (0.05, "its learning rate is 0.5 times those that tuning chose elsewhere."),
         (
             0.33,
-            "its learning rate is 3.3 times those that tuning chose elsewhere. It may keep answers at",
+            "its learning rate is 3 times those that tuning chose elsewhere. It may keep answers at",
         ),
     ],
 )
