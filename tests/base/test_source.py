@@ -415,7 +415,9 @@ for _ in range(2000):
 
 
 @pytest.mark.parametrize(
-    "value", [_Answers(), _wraps_itself, _HOLDS_ITSELF, _DOUBLED, _CHAIN, mock.call, mock.MagicMock()], ids=id
+    "value",
+    [_Answers(), _wraps_itself, _HOLDS_ITSELF, _DOUBLED, _CHAIN, mock.call, mock.MagicMock()],
+    ids=["any attribute", "wraps itself", "holds itself", "doubled", "chain", "call", "mock"],
 )
 def test_a_value_without_end_has_a_hash(value: Any) -> None:
     assert len(class_hash(type("Some", (), {"value": value}))) == 16
