@@ -410,8 +410,10 @@ _HOLDS_ITSELF: list[Any] = [1]
 _HOLDS_ITSELF.append(_HOLDS_ITSELF)
 _DOUBLED: list[Any] = [1]
 _CHAIN: list[Any] = [1]
+for _ in range(100):
+    _DOUBLED = [_DOUBLED, _DOUBLED]
 for _ in range(2000):
-    _DOUBLED, _CHAIN = ([_DOUBLED, _DOUBLED] if len(str(_)) < 3 else _DOUBLED), [_CHAIN]
+    _CHAIN = [_CHAIN]
 
 
 @pytest.mark.parametrize(
