@@ -218,8 +218,10 @@ class _File:
 
     def check_rate(self) -> None:
         """Check the control rate that the file gives, if any. The world must run, with errors of its own."""
-        rate, own = self._rate, None if self._rate is None else control_rate(self._task)
-        if rate is not None and own is not None and not abs(rate - own) <= FARTHEST_RATE * own:  # also if NaN
+        if (rate := self._rate) is None:
+            return
+        own = control_rate(self._task)
+        if own is not None and not abs(rate - own) <= FARTHEST_RATE * own:  # also if it is NaN
             raise self._error(
                 f"it was recorded at {rate:g} steps per second, but the world {self._task.world} makes "
                 f"{own:g}: each action would last a different time"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 from collections.abc import Iterable
 from itertools import groupby
@@ -13,7 +12,7 @@ from clbench.records.paths import RECORDS, table_parts
 from clbench.spec.policies import DEFAULT_POLICY
 
 from .frontier import FACTOR
-from .paths import CONTROLS, LADDER
+from .paths import CONTROLS, LADDER, sibling
 from .runs import Run
 
 
@@ -32,8 +31,7 @@ def run_command(scenario: str, *labels: str, records: Path = RECORDS, controls: 
     factor = labels[0].partition("@")[2]
     changes += [(FACTOR, factor)] if factor else []
     settings = [f"--set.{name} {value}" for name, value in changes]
-    ladder = Path(os.path.normpath(records / ".." / LADDER.name))
-    folder = (ladder if factor else controls) if changes else records
+    folder = (sibling(records, LADDER.name) if factor else controls) if changes else records
     option = [] if folder == RECORDS else [f"--records {shlex.quote(folder.as_posix())}"]
     return " ".join(["clbench run", scenario, *methods, *settings, *option])
 

@@ -23,4 +23,9 @@ FILM = "film.gif"
 
 def beside(records: Path, name: str) -> Path:
     """Return the path of a folder beside a folder of records, without following a link."""
-    return Path(os.path.normpath(records.absolute() / ".." / name))
+    return sibling(records.absolute(), name)
+
+
+def sibling(folder: Path, name: str) -> Path:
+    """Return the path of a folder beside another one, relative if that one is, also for "." and ".."."""
+    return Path(os.path.normpath(folder / ".." / name))
