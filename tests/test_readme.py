@@ -115,7 +115,7 @@ def test_the_readme_states_how_many_claims_there_are_and_how_many_are_decided() 
     )
     text = " ".join(README.read_text(encoding="utf-8").split())
     stated = (
-        f"judge {len(papers)} statements of papers. On at least one board, {hold} hold, {in_part} hold in "
+        f"judge {len(papers)} claims of papers. On at least one board, {hold} hold, {in_part} hold in "
         f"part, and {fail} do not hold."
     )
     assert stated in text

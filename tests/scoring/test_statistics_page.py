@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import blocks_of
 
 from clbench import read_record
 from clbench.cli.runs import run as run_command
@@ -111,6 +112,17 @@ def test_the_examples_of_the_page_give_its_results() -> None:
         named = {str(part.arg): ast.literal_eval(part.value) for part in call.keywords}
         got = functions[ast.unparse(call.func)](*values, **named)
         assert (f"{got:.2f}" if isinstance(got, float) else str(got)) == result
+
+
+def test_its_script_prints_the_paired_interval_that_the_page_shows(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (script,) = (
+        block for block in blocks_of(ROOT / "docs" / "guide" / "statistics.md", "python") if "ttest" in block
+    )
+    monkeypatch.chdir(ROOT)
+    exec(compile(script, "statistics.md", "exec"), {})
+    assert capsys.readouterr().out.strip() == script.rpartition("# ")[2].strip()
 
 
 @pytest.mark.long
