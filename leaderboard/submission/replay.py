@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import hypergeom
 
 from clbench.base.errors import InputError
-from clbench.base.progress import ProgressCallback
+from clbench.base.progress import ProgressCallback, announce
 from clbench.data.training_data import TrainingData
 from clbench.evaluation.answers import answer
 from clbench.evaluation.checks import Checker
@@ -89,6 +89,7 @@ def replay(subject: Subject, progress: ProgressCallback) -> list[Check]:
 
 def _same_pretraining(subject: Subject) -> bool:
     """Return whether the run began with the policy that pretraining gives here."""
+    announce("pretraining")
     _, folder = pretrained_policy(subject.scenario, subject.spec.seed)
     return pretrained_hash(folder) == subject.run.record.fingerprint.get("pretrained")
 

@@ -16,6 +16,7 @@ from safetensors.torch import load_file, save_file
 from verification import TOY, edit, failures, flip, verify
 
 from clbench.base.cache import MANIFEST, cached
+from clbench.base.progress import listen
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.method import Method
 from clbench.policy.policy import Policy
@@ -256,7 +257,13 @@ def test_a_step_that_is_said_to_be_much_cheaper_or_dearer_leaves_the_tier_open(t
 
 @pytest.mark.long
 def test_a_record_can_be_replayed_from_policies_that_are_made_again(mine: Path) -> None:
-    checks = verify(mine, "replayed", episodes=20)
+    places: list[str] = []
+    listen(lambda place, remark: places.append(place))
+    try:
+        checks = verify(mine, "replayed", episodes=20)
+    finally:
+        listen(None)
+    assert places[0] == "pretraining"  # it may take minutes
     assert failures(checks) == ""
     assert any(check.found.startswith("20 of ") for check in checks)
     assert any(check.found == "trained again" for check in checks)
