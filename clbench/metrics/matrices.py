@@ -65,11 +65,11 @@ def from_matrix(
     """Return every metric that a success matrix allows, and the reasons why the others have no value.
 
     Args:
-        matrix: Success rates, (stages, tasks) or (seeds, stages, tasks), NaN where missing; or several such
-            arrays by the name of the method. Row k is the end of stage k, in which target k is learned. If
-            there is one row more than targets, the first row is stage 0, before the first target. The metric
-            gain compares each seed with the same one of a method called sft, and intransigence with that of
-            one called joint.
+        matrix: Success rates, (stages, tasks) or (seeds, stages, tasks), NaN or masked where missing; or
+            several such arrays by the name of the method. Row k is the end of stage k, in which target k is
+            learned. If there is one row more than targets, the first row is stage 0, before the first target.
+            The metric gain compares each seed with the same one of a method called sft, and intransigence
+            with that of one called joint.
         tasks: Names of the columns, by default "task 1", "task 2" and so on.
         retained: Names of the tasks that are known before the first target and never trained again; a
             single string is one name, here and below.
@@ -133,7 +133,7 @@ def _array(values: ArrayLike, method: str) -> Array:
     """Return the success rates of a method as an array, (stages, tasks) or (seeds, stages, tasks)."""
     name = f" of method {quoted(method)}" if method else ""
     try:
-        array = np.asarray(values, dtype=np.float64)
+        array = np.ma.filled(np.ma.asarray(values, dtype=np.float64), np.nan)  # a masked rate is missing
     except (TypeError, ValueError) as error:
         raise InputError(
             f"The matrix{name} is not an array of numbers: expected rows of equal length, NaN where a rate "
@@ -246,6 +246,8 @@ def layout_of(
 def _expected_stages(layout: Layout) -> str:
     """Return which stages a table with these targets has, and what to do if there are more or fewer."""
     count = len(layout.target)
+    if not count:
+        return "Expected stage 0 alone: no task is left as a target. Name fewer ones as retained or held out."
     return (
         f"Expected stages 1 to {count}, one for each of {counted(count, 'target')}: stage k is the end of "
         "the training on target k, and stage 0, which may be missing, is before the first. Name tasks that "

@@ -37,6 +37,11 @@ def _drops(rates: Rates) -> Array:
     return rates.learned[..., None, :] - _matrix(rates)
 
 
+def _final_drops(rates: Rates) -> Array:
+    """Return R[k][k] - R[K][k] for each target k but the last, (..., targets - 1)."""
+    return rates.learned[..., :-1] - rates.target[..., -1, :-1]
+
+
 def _weighted(values: Array, weights: Array) -> Array:
     """Return the sum of values (..., n, n) times weights (n, n), NaN if all weights are 0."""
     if not weights.any():
@@ -122,7 +127,7 @@ def forgetting_mammoth(rates: Rates) -> Array:
 )
 def forgetting_avalanche(rates: Rates) -> Array:
     """Drop from the success right after a target was learned: backward transfer with the other sign."""
-    return average(_drops(rates)[..., -1, :-1] if len(rates.layout.target) > 1 else rates.learned[..., :0])
+    return average(_final_drops(rates))
 
 
 @metric(
@@ -247,7 +252,7 @@ def worst_case_accuracy(rates: Rates) -> Array:
     formula="mean over the targets k and the stages l after k of (R[l-1][k] - R[l][k]) / M[k]; M[k] is the "
     "highest R[l][k] of all stages l from 0",
     source="CORA, arXiv 2110.10067 (isolated forgetting), without its factor 10",
-    missing="There are fewer than two targets, a success on one is missing, or one never has any success.",
+    missing="There are fewer than two targets, or the success on one before the last is missing or always 0.",
     low=-1.0,
     higher_is_better=False,
     units="share of the highest success",
@@ -265,7 +270,7 @@ def isolated_forgetting_cora(rates: Rates) -> Array:
     formula="mean over the targets k and the stages l before k, from 1, of (R[l][k] - R[l-1][k]) / M[k]; "
     "M[k] is the highest R[l][k] of all stages l from 0",
     source="CORA, arXiv 2110.10067 (isolated zero-shot forward transfer), without its factor 10",
-    missing="There are fewer than two targets, a success on one is missing, or one never has any success.",
+    missing="There are fewer than two targets, or the success on one after the first is missing or always 0.",
     low=-1.0,
     units="share of the highest success",
 )
@@ -353,9 +358,7 @@ def _over_later(rates: Rates) -> Array:
 )
 def negative_backward_transfer_arfm(rates: Rates) -> Array:
     """Drop in success on the earlier targets after the last one; a gain counts as 0."""
-    if len(rates.layout.target) < 2:
-        return average(rates.learned[..., :0])
-    return average(np.maximum(_drops(rates)[..., -1, :-1], 0))
+    return average(np.maximum(_final_drops(rates), 0))
 
 
 @metric(

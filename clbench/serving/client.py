@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import re
 import socket
@@ -75,9 +76,15 @@ class ServedPolicy:
         """Return chunks of actions (B, H, A) for the observations of B episodes.
 
         Raises:
-            InputError: The policy failed, took too long, returned no actions, or cannot be reached any more.
+            InputError: The request is too large, or the policy failed, took too long, returned no actions, or
+                cannot be reached any more.
         """
         request = pack(observations)
+        if len(request) > LARGEST_MESSAGE:
+            raise InputError(
+                f"The pictures of one request take {math.ceil(len(request) / 2**20)} MB, and the limit is "
+                f"{LARGEST_MESSAGE // 2**20} MB: choose a smaller --picture-size, or fewer --pictures."
+            )
         for _ in range(ATTEMPTS):
             connection = self._connected()
             try:
@@ -232,8 +239,10 @@ class ServedPolicy:
 def _is_address(text: str) -> bool:
     """Return whether websockets accepts an address; its own error would show the password."""
     try:
-        return parse_uri(text).port != 0
-    except (InvalidURI, ValueError):  # the port is not a number, or a password is not UTF-8
+        uri = parse_uri(text)
+        uri.host.encode("idna")  # as the socket does
+        return uri.port != 0
+    except (InvalidURI, ValueError):  # an impossible host or port, or a password that is not UTF-8
         return False
 
 

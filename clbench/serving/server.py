@@ -32,6 +32,7 @@ reads it from the environment variable CLBENCH_POLICY_TOKEN.
 from __future__ import annotations
 
 import hmac
+import math
 import re
 import socket
 import sys
@@ -364,9 +365,16 @@ def _decode(values: dict[Any, Any]) -> Any:
         shape, data = values[b"shape"], values[b"data"]
         if min(shape, default=0) < 0:  # NumPy would choose a size for it
             raise ValueError(f"An array cannot have the shape {shape}.")
-        return (np.frombuffer(data, dtype) if data else np.empty(0, dtype)).reshape(shape).copy()
+        array = (np.frombuffer(data, dtype) if data else np.empty(0, dtype)).reshape(shape)
+        # rows without values take no bytes, so that a short message may have any number of them
+        if math.prod(max(size, 1) for size in array.shape) > LARGEST_MESSAGE:
+            raise ValueError(f"An array cannot have the shape {shape}.")
+        return array.copy()
     if b"__npgeneric__" in values:
-        return _dtype(values[b"dtype"]).type(values[b"data"])
+        dtype, data = _dtype(values[b"dtype"]), values[b"data"]
+        if dtype.kind == "S" and not isinstance(data, bytes):  # of a number n, NumPy would make n bytes
+            raise ValueError(f"A scalar of the type {dtype} must be bytes, not {type(data).__name__}.")
+        return dtype.type(data)
     return values
 
 

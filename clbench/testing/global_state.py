@@ -57,6 +57,9 @@ SETTINGS: Mapping[str, _Setting] = {
 }
 """Settings of the whole process, each with a function that reads and one that restores it."""
 
+BY_IMPORTS = ("os.environ", "sys.path", "warnings.filters", "the file ", "the folder ")
+"""Beginnings of the descriptions of changes that the import of a package may make, too, once in a process."""
+
 GENERATORS: Mapping[str, _Setting] = {
     "Python's random": (random.getstate, random.setstate),
     "numpy.random": (np.random.get_state, np.random.set_state),
@@ -91,8 +94,8 @@ def watched(found: list[str], *, generators: bool) -> Iterator[None]:
     """Add descriptions of the side effects of the block to `found`, and restore the settings.
 
     Args:
-        found: Receives a line for each setting that differs afterwards, and for each file outside
-            clbench's cache that was opened for writing and still exists.
+        found: Receives a line for each setting that differs afterwards, and for each file or folder outside
+            clbench's cache that was written and still exists.
         generators: Whether the global random generators count as settings.
     """
     settings = {**SETTINGS, **(GENERATORS if generators else {})}
@@ -106,9 +109,11 @@ def watched(found: list[str], *, generators: bool) -> Iterator[None]:
                     found.append(_difference(name, before[name], after))
                     settings[name][1](before[name])
     cache = cache_folder()
-    # /dev/null, which silences a library, is not a regular file
-    left = (path for path in dict.fromkeys(paths) if path.is_file() and cache not in path.parents)
-    found.extend(f"the file {path} is written" for path in left)
+    for path in dict.fromkeys(paths):
+        # /dev/null, which silences a library, is no regular file; imports write to __pycache__
+        kind = "file" if path.is_file() else "folder" if path.is_dir() else None
+        if kind and cache not in (path, *path.parents) and "__pycache__" not in path.parts:
+            found.append(f"the {kind} {path} is written")
 
 
 def _difference(name: str, before: Any, after: Any) -> str:
@@ -213,14 +218,16 @@ def _copied(values: Mapping[str, Any]) -> dict[str, Any]:
 
 # ---- files -------------------------------------------------------------------------------------------------
 
+_WRITING = {"open": 0, "os.rename": 1, "os.mkdir": 0}
+"""Audit events of what makes a file or a folder, with the place of its path among their arguments."""
 _recording: tuple[int, list[Path]] | None = None
-"""Id of the thread whose opened files are recorded, and the list of these files."""
+"""Id of the thread whose files and folders are recorded, and the list of these."""
 _hooked = False
 
 
 @contextmanager
 def _written() -> Iterator[list[Path]]:
-    """Record the files that Python opens for writing in the block; files of compiled libraries are missed."""
+    """Record what Python writes and makes in the block; files of compiled libraries are missed."""
     global _recording, _hooked
     if not _hooked:  # an audit hook stays until the process ends
         sys.addaudithook(_audit)
@@ -234,8 +241,10 @@ def _written() -> Iterator[list[Path]]:
 
 
 def _audit(event: str, arguments: tuple[Any, ...]) -> None:
-    if event != "open" or _recording is None or _recording[0] != threading.get_ident():
+    if event not in _WRITING or _recording is None or _recording[0] != threading.get_ident():
         return
-    path, _, flags = arguments
-    if isinstance(path, str | bytes | os.PathLike) and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
+    if event == "open" and not arguments[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
+        return
+    path = arguments[_WRITING[event]]
+    if isinstance(path, str | bytes | os.PathLike) and not (event == "os.mkdir" and os.path.isdir(path)):
         _recording[1].append(Path(os.fsdecode(path)).absolute())

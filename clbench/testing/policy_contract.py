@@ -281,7 +281,7 @@ def checkpoints(subject: Subject) -> None:
 
 
 def abilities(subject: Subject) -> None:
-    """The policy has the abilities that it declares, and no others."""
+    """The policy has the abilities that it declares."""
     policy, batch = subject.build(), subject.batch
     if not isinstance(subject.cls.abilities, frozenset | set):
         expected = f'a set of texts, such as abilities = frozenset({{"{ABILITIES[0]}"}})'

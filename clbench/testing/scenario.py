@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -30,6 +29,7 @@ from clbench.spec.language import LENGTHS, fitting_length, word_id, word_ids
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
+from clbench.testing.global_state import same
 from clbench.worlds.lanes import Lanes
 from clbench.worlds.observation import Observer
 from clbench.worlds.world import World
@@ -140,13 +140,13 @@ def _check_spaces(name: str, world: World) -> tuple[spaces.Box, spaces.Box]:
     return state, action
 
 
-@dataclass(frozen=True)
-class _Episode:
-    """The outcome of an episode: states (T + 1, S), actions (T, A), and whether it was a success."""
+class _Episode(NamedTuple):
+    """An episode: states (T + 1, S), actions (T, A), and the reward and success of each step, (T,)."""
 
     states: NDArray[np.float32]
     actions: NDArray[np.float32]
-    success: bool
+    rewards: NDArray[np.float64]
+    successes: NDArray[np.bool_]
 
 
 def _check_task(task: Task, world: World, episodes: int, success: float) -> None:
@@ -154,14 +154,14 @@ def _check_task(task: Task, world: World, episodes: int, success: float) -> None
     expert = _aimless(world) if recorded else resolve(task.expert)(task.name)
     seeds = [derive_seed("check", task.name, number) for number in range(episodes)]
     played = [_play(task, world, seed, expert) for seed in seeds]
-    share = sum(episode.success for episode in played) / episodes
+    share = sum(episode.successes.any() for episode in played) / episodes
     if share < success and not recorded:
         raise ScenarioError(
             f"task {task.name}: its expert {task.expert} succeeds in {share:.0%} of {episodes} episodes, not "
             f"in {success:.0%}. Correct it, the success rule or the horizon of {task.horizon} steps."
         )
     nothing = np.zeros(world.action_space.shape or (), np.float32)
-    if all(_play(task, world, seed, lambda _: nothing).success for seed in seeds[:STILL]):
+    if all(_play(task, world, seed, lambda _: nothing).successes.any() for seed in seeds[:STILL]):
         raise ScenarioError(f"task {task.name}: doing nothing completes it.")
     if episodes > 1 and len({episode.states[0].tobytes() for episode in played}) == 1:
         raise ScenarioError(f"task {task.name}: all seeds have the same initial state.")
@@ -169,7 +169,7 @@ def _check_task(task: Task, world: World, episodes: int, success: float) -> None
     with closing(resolve(task.world)()) as new:
         afresh = _play(task, new, seeds[0], expert)
     for other, where in ((again, "after other episodes"), (afresh, "in a new world")):
-        if not np.array_equal(other.states, played[0].states):
+        if not same(other, played[0]):
             raise ScenarioError(
                 f"task {task.name}: the same seed and actions give a different episode {where}."
             )
@@ -200,7 +200,7 @@ def _aimless(world: World) -> Callable[[NDArray[np.float32]], NDArray[np.float32
 def _play(task: Task, world: World, seed: int, act: Any) -> _Episode:
     """Run an episode, and check that the world keeps its rules."""
     state, info = world.reset(seed=seed, options={"task": task.name})
-    states, actions, done = [state], [], False
+    states, actions, rewards, successes, done = [state], [], [], [], False
     for step in range(task.horizon + 1):
         where = f"task {task.name}, step {step}"
         if not world.observation_space.contains(state) or not np.isfinite(state).all():
@@ -228,7 +228,9 @@ def _play(task: Task, world: World, seed: int, act: Any) -> _Episode:
         states.append(state)
         if not np.isfinite(float(reward)):
             raise ScenarioError(f"{where}: the reward is {reward}.")
-    return _Episode(np.array(states), np.array(actions), bool(done))
+        rewards.append(float(reward))
+        successes.append(bool(done))
+    return _Episode(np.array(states), np.array(actions), np.array(rewards), np.array(successes))
 
 
 def _check_side_by_side(task: Task, seeds: list[int], alone: list[_Episode]) -> None:
@@ -236,13 +238,14 @@ def _check_side_by_side(task: Task, seeds: list[int], alone: list[_Episode]) -> 
     lanes = list(range(len(seeds)))
     with closing(Lanes(len(seeds))) as places:
         first = places.reset(lanes, seeds, [task] * len(seeds))
-        found = [[state] for state in first]
+        equal = np.array_equal(first, [episode.states[0] for episode in alone])
         for step in range(max(len(episode.actions) for episode in alone)):
             going = [lane for lane in lanes if step < len(alone[lane].actions)]
-            states, *_ = places.step(going, np.stack([alone[lane].actions[step] for lane in going]))
-            for lane, state in zip(going, states, strict=True):
-                found[lane].append(state)
-    if any(not np.array_equal(np.array(found[lane]), alone[lane].states) for lane in lanes):
+            episodes = [alone[lane] for lane in going]
+            found = places.step(going, np.stack([one.actions[step] for one in episodes]))
+            rows = [(one.states[step + 1], one.rewards[step], one.successes[step]) for one in episodes]
+            equal = equal and same(found, tuple(np.array(column) for column in zip(*rows, strict=True)))
+    if not equal:
         raise ScenarioError(
             f"task {task.name}: its episodes in parallel lanes differ from its episodes in a single "
             f"{task.world}."

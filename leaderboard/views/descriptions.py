@@ -147,7 +147,7 @@ def _hyper_parameters(cls: type[Method]) -> list[HyperParameter]:
     return [
         HyperParameter(field.name, _default(field), " ".join(meanings.get(field.name, [])))
         for field in dataclasses.fields(cls)
-        if field.default != COMMON.get(field.name, dataclasses.MISSING)
+        if field.name not in COMMON or field.default != COMMON[field.name]
     ]
 
 

@@ -76,6 +76,14 @@ def test_a_triangle_has_every_drop_but_those_that_need_targets_before_they_are_l
     assert report["question_retention"].reason == METRICS["question_retention"].missing
 
 
+def test_a_masked_rate_is_missing() -> None:
+    rates = np.ma.masked_less([[0.6, -1], [0.2, 0.9]], 0)
+    for matrix in (rates, [rates, rates]):
+        report = from_matrix(matrix)
+        assert report["adaptation"].value == pytest.approx(0.75)
+        assert (report["forward_transfer_diaz_rodriguez"].value, report.unit) == (None, "share")
+
+
 def test_seeds_give_the_mean_of_their_values_and_an_interval() -> None:
     other = np.array(TRIANGLE) - 0.2
     report = from_matrix(np.array([TRIANGLE, other, TRIANGLE]))
@@ -350,6 +358,10 @@ def test_a_table_of_pandas_has_a_row_for_every_metric_and_method() -> None:
         (
             {"matrix": [[0.5, 0.5, 0.5]]},
             r"The matrix has 1 row\. Expected stages 1 to 3.*retained or held out",
+        ),
+        (
+            {"matrix": [[0.5, 0.5], [0.5, 0.4]], "retained": ["task 1", "task 2"]},
+            "has 2 rows. Expected stage 0 alone: no task is left as a target. Name fewer ones as retained",
         ),
         ({"matrix": [[-0.5]]}, r"stage 1, task 'task 1': expected a share from 0 to 1, found -0\.5"),
         ({"matrix": [[500]]}, r"stage 1, task 'task 1': expected per cent from 0 to 100, found 500"),

@@ -218,6 +218,22 @@ def test_a_target_without_any_success_leaves_no_share_of_the_highest(scores: Cal
     assert measure("isolated_zero_shot_transfer_cora", run) == pytest.approx(0)
 
 
+@pytest.mark.parametrize(
+    ("name", "without", "words"),
+    [
+        ("isolated_forgetting_cora", 2, "the success on one before the last is missing or always 0"),
+        ("isolated_zero_shot_transfer_cora", 0, "the success on one after the first is missing or always 0"),
+    ],
+)
+def test_a_share_of_the_highest_needs_no_success_on_the_one_target_that_its_reason_leaves_out(
+    name: str, without: int, words: str, scores: Callable[..., Scores]
+) -> None:
+    targets = np.full((3, 3), 0.9)
+    targets[:, without] = 0
+    assert measure(name, scores(skill_and(targets))) is not None
+    assert words in METRICS[name].missing
+
+
 def test_skills_that_were_not_evaluated_on_the_way_have_no_minimum(scores: Callable[..., Scores]) -> None:
     assert measure("minimum_retention", scores(PUBLISHED, curves=OWN_CURVES)) is None
 

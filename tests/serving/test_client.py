@@ -208,7 +208,10 @@ def test_no_message_shows_the_password_of_an_address(
     assert not any(secret in told for secret in ("user:", "sek", "ret@"))
 
 
-@pytest.mark.parametrize("address", ["localhost:8000", "http://localhost", "ws://", "ws://host:port"])
+@pytest.mark.parametrize(
+    "address",
+    ["localhost:8000", "http://localhost", "ws://", "ws://host:port", "ws://my..host:1", f"ws://{'x' * 64}"],
+)
 def test_another_address_is_refused(address: str) -> None:
     with pytest.raises(InputError, match=r"The address of a policy is ws://host:port, not "):
         ServedPolicy(address, patience=0.1)
@@ -275,6 +278,19 @@ def test_a_reply_that_is_no_reply_is_an_error(handle: Callable[..., None], messa
         served = ServedPolicy(address, timeout=0.2)
         with pytest.raises(InputError, match=message):
             served(OBSERVATIONS)
+        served.close()
+
+
+def test_a_request_that_no_server_would_read_is_refused_before_it_is_sent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("clbench.serving.client.LARGEST_MESSAGE", 2 * 2**20)
+    pictures = {**OBSERVATIONS, "pictures/wrist": np.zeros((40, 200, 200, 3), np.uint8)}
+    with guarded() as place:
+        served = ServedPolicy(f"ws://{place}")
+        with pytest.raises(InputError, match="take 5 MB, and the limit is 2 MB: choose a smaller --pict"):
+            served(pictures)
+        assert served(OBSERVATIONS).shape == (2, 1, 4)
         served.close()
 
 

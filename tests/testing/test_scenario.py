@@ -147,6 +147,41 @@ class Askew(ToyWorld):
         return PlainVectorWorld(Remembering, lanes)
 
 
+class Wavering(ToyWorld):
+    """Its rewards depend on the number of earlier steps of all episodes."""
+
+    steps = 0
+
+    def step(self, action: Any) -> Any:
+        self.steps += 1
+        state, reward, *rest = super().step(action)
+        return state, reward + self.steps, *rest
+
+
+class Without(PlainVectorWorld):
+    """In its lanes no episode succeeds."""
+
+    def step(self, lanes: Any, actions: Any) -> Any:
+        states, rewards, successes = super().step(lanes, actions)
+        return states, rewards, np.zeros_like(successes)
+
+
+class Barred(ToyWorld):
+    """Its episodes never succeed side by side."""
+
+    @staticmethod
+    def vector_world(lanes: int, threads: int) -> PlainVectorWorld:
+        return Without(ToyWorld, lanes)
+
+
+class Paid(ToyWorld):
+    """Its rewards differ side by side, where every state and success is the same."""
+
+    @staticmethod
+    def vector_world(lanes: int, threads: int) -> PlainVectorWorld:
+        return PlainVectorWorld(Wavering, lanes)
+
+
 def lazy(task: str) -> Callable[[Any], Any]:
     return lambda _: np.zeros(2, np.float32)
 
@@ -209,6 +244,7 @@ def test_the_toy_passes() -> None:
         ("Broken", r":Broken: FileNotFoundError: scene\.xml"),
         ("Stuck", "task left: KeyError: 'gripper'"),
         ("Remembering", "the same seed and actions give a different episode after other episodes"),
+        ("Wavering", "the same seed and actions give a different episode after other episodes"),
         ("Alike", "all seeds have the same initial state"),
         ("Reusing", "step 0: the world changed its last state in place and returned it: return a copy"),
         ("Mute", r'terminated is True, info\["success"\] is None'),
@@ -218,6 +254,8 @@ def test_the_toy_passes() -> None:
         ("Strong", "actions must go from -1 to 1"),
         ("Framed", "observation space must be a Box of one axis"),
         ("Askew", "its episodes in parallel lanes differ from its episodes in a single"),
+        ("Barred", "its episodes in parallel lanes differ from its episodes in a single"),
+        ("Paid", "its episodes in parallel lanes differ from its episodes in a single"),
     ],
 )
 def test_a_faulty_world_is_named(world: str, message: str) -> None:
