@@ -78,7 +78,8 @@ records: .venv/installed-libero
 	$(BIN)/clbench run clbench/MetaWorld-v1 $(REFERENCES) $(METHODS) $(CONSFT_CONTROLS) --seeds 8
 	$(BIN)/clbench run clbench/PointMaze-v1 $(REFERENCES) $(MAZE) $(CONSFT_CONTROLS) --seeds 4
 	$(BIN)/clbench run $(KNOWLEDGE) frozen joint sft stop_gradient aegis lora --seeds 4
-	$(BIN)/clbench run clbench/LiberoSpatial-v1 $(SCHEDULED) experience_replay from_scratch frozen joint sft --seeds 4
+	$(BIN)/clbench run clbench/LiberoSpatial-v1 $(SCHEDULED) $(CONSFT_CONTROLS) experience_replay from_scratch frozen joint sft \
+		--seeds 4
 	$(BIN)/clbench run clbench/Fetch-v1 frozen sft consft aegis experience_replay lora stop_gradient --seeds 3 \
 		--policy discrete_diffusion
 	$(BIN)/clbench run clbench/Fetch-v1 sft experience_replay lora --seeds 1 --policy flow-base

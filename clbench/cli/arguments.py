@@ -92,7 +92,7 @@ def print_json(values: object) -> None:
 
 
 def items_of(option: str, text: str) -> list[str]:
-    """Return the items of a list with commas, each once and without the space around it.
+    """Return the items of a list with commas outside brackets, each once and without the space around it.
 
     Args:
         option: Name of the option or argument.
@@ -101,7 +101,7 @@ def items_of(option: str, text: str) -> list[str]:
     Raises:
         InputError: An item is empty.
     """
-    items = [item.strip() for item in text.split(",")]
+    items = [item.strip() for item in re.split(r",(?![^[]*])", text)]
     if "" in items:
         raise InputError(f"{option} has an empty item: {text!r}. Separate items with single commas.")
     return list(dict.fromkeys(items))
@@ -134,8 +134,9 @@ def check_names(scenarios: Iterable[str], methods: Iterable[str]) -> None:
 
 
 def error_line(message: object) -> Text:
-    """Return an error message as one line."""
-    return Text(f"error: {printable(' '.join(str(message).split()))}", style="bold red")
+    """Return an error message as one line, with the spaces of the names in it."""
+    lines = (line.strip() for line in str(message).splitlines())
+    return Text(f"error: {printable(' '.join(filter(None, lines)))}", style="bold red")
 
 
 def read_paths(_: App, __: Sequence[str], arguments: ArgumentCollection) -> None:

@@ -143,6 +143,8 @@ def metrics(
     with checked_input():
         if name and markdown:
             raise InputError("The page holds all metrics: give a name or --markdown, not both.")
+        if markdown and as_json:
+            raise InputError("--markdown writes a page, and --json prints JSON: give one of them.")
         if name and is_table(name):
             path = find(name)
             report = from_csv(path, retained=retained, target=target or None, held_out=held_out, unit=unit)

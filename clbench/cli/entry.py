@@ -23,8 +23,12 @@ def main() -> None:
     and the number of the signal, as shells report it.
     """
     _end_at_once_when_stopped()
-    if sys.stdout is None:  # it was closed: >&-
-        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 -- until the process ends
+    for place, name in enumerate(("stdout", "stderr"), 1):
+        if getattr(sys, name) is None:  # it was closed: >&-
+            # the next open file would get its number, and with it what libraries and children print there
+            os.dup2(os.open(os.devnull, os.O_WRONLY), place)
+            os.set_inheritable(place, True)
+            setattr(sys, name, open(place, "w", encoding="utf-8"))  # noqa: SIM115 -- until the process ends
     for stream in (sys.stdout, sys.stderr):  # a terminal may lack a sign, such as that of plus and minus
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")

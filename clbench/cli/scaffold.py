@@ -132,8 +132,9 @@ def check_new_name(name: str, kind: str) -> None:
             f"{quoted(name)} cannot be the name of a module: it must begin with a letter, and have at most "
             f"50 lowercase letters, digits and _.{hint}"
         )
-    if keyword.iskeyword(name):
-        raise InputError(f"{name!r} is a Python keyword. Did you mean {f'{name}_{kind}'!r}?")
+    word = next(filter(keyword.iskeyword, (name, class_name(name))), None)
+    if word is not None:
+        raise InputError(f"{word!r} is a Python keyword. Did you mean {f'{name}_{kind}'!r}?")
     check_method_name(name)
     if find_spec(name) is not None:
         raise InputError(f"A module named {name!r} already exists. Did you mean {f'{name}_{kind}'!r}?")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args
 
@@ -36,17 +37,6 @@ from clbench.spec.protocol import DEFAULT_SEEDS
 
 if TYPE_CHECKING:
     from clbench.runs.spec import ResolvedRun
-
-NOT_GIVEN: Mapping[str, object] = {
-    "--all": False,
-    "--seeds": DEFAULT_SEEDS,
-    "--first-seed": 0,
-    "--order": 0,
-    "--policy": DEFAULT_POLICY,
-    "--perturb": False,
-    "--device": "cpu",
-}
-"""Values of the options that choose among the runs of a scenario, where nobody gave them."""
 
 State = Literal["done", "running", "failed", "damaged", "unreadable", "to do"]
 
@@ -87,13 +77,13 @@ def status(
     /,
     *methods: MethodName,
     every: Annotated[bool, Parameter(name="--all")] = False,
-    seeds: Seeds = DEFAULT_SEEDS,
-    first_seed: Seed = 0,
-    order: Seed = 0,
-    policy: PolicyName = DEFAULT_POLICY,
+    seeds: Seeds | None = None,
+    first_seed: Seed | None = None,
+    order: Seed | None = None,
+    policy: PolicyName | None = None,
     perturb: bool = False,
     records: Path = RECORDS,
-    device: str = "cpu",
+    device: str | None = None,
     changes: Annotated[dict[str, str] | None, Parameter(name="--set")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -107,14 +97,14 @@ def status(
         scenarios: Gymnasium id of the scenario, or several ids separated by commas.
         methods: Names of installed methods, or module:Class.
         every: All installed methods.
-        seeds: Number of seeds.
-        first_seed: The first seed.
+        seeds: Number of seeds (default: 4).
+        first_seed: The first seed (default: 0).
         order: Order of the targets, as for `clbench run`.
-        policy: flow or discrete_diffusion; a larger size, for example flow-base (5 million parameters) or
-            flow-large (40 million); or a class of your own, as module:Class.
+        policy: flow (default) or discrete_diffusion; a larger size, for example flow-base (5 million
+            parameters) or flow-large (40 million); or a class of your own, as module:Class.
         perturb: Count only records with perturbed episodes.
         records: Folder of the records.
-        device: Device that runs the policies: a record of another device does not count.
+        device: Device that runs the policies (default: cpu): a record of another device does not count.
         changes: Hyper-parameters that differ from those tuned for the scenario or, without tuning, from the
             method's defaults, as --set.name value.
         as_json: Print a JSON list with an object for each run, and no table.
@@ -122,7 +112,10 @@ def status(
     add_cwd_to_path()
     with checked_input():
         ids = [] if scenarios is None else items_of("SCENARIOS", scenarios)
-        given = _given((every, seeds, first_seed, order, policy, perturb, device), changes or {})
+        options = {"--seeds": seeds, "--first-seed": first_seed, "--order": order, "--policy": policy}
+        options |= {"--all": every or None, "--perturb": perturb or None, "--device": device}
+        given = [name for name, value in options.items() if value is not None]
+        given += [f"--set.{name}" for name in changes or {}]
         if given and not ids:
             chosen = f"{listed(given)} {'needs' if len(given) == 1 else 'need'}"
             raise InputError(f"{chosen} a scenario: name the scenario first.")
@@ -130,10 +123,9 @@ def status(
         if methods or given:
             from clbench.runs.spec import RunSpec
 
-            first = RunSpec(
-                "", "", first_seed, changes or {}, device, order=order, perturb=perturb, policy=policy
-            )
-            runs = requested(ids, methods, every, seeds, first, records)
+            first = RunSpec("", "", first_seed or 0, changes or {}, device or "cpu", perturb=perturb)
+            first = replace(first, order=order or 0, policy=policy or DEFAULT_POLICY)
+            runs = requested(ids, methods, every, seeds or DEFAULT_SEEDS, first, records)
             states = [run_state(run.path(records), run) for run in runs]
         else:
             states = [run_state(path) for path in found_runs(records, ids)]
@@ -150,13 +142,6 @@ def status(
         if line:
             print_plain(console, line)
     console.print(_summary(states), highlight=False)
-
-
-def _given(values: Iterable[object], changes: Iterable[str]) -> list[str]:
-    """Return the names of the options that were given: those of `NOT_GIVEN` by their values, and --set."""
-    pairs = zip(NOT_GIVEN.items(), values, strict=True)
-    options = [name for (name, usual), value in pairs if value != usual]
-    return [*options, *(f"--set.{name}" for name in changes)]
 
 
 def run_state(path: Path, run: ResolvedRun | None = None) -> RunState:

@@ -25,6 +25,7 @@ from clbench.cli.arguments import (
     add_cwd_to_path,
     check_names,
     checked_input,
+    checked_writing,
     chosen_methods,
     items_of,
     whole_number,
@@ -120,6 +121,8 @@ def tune(
     if values:
         found = run({BASELINE: [{}], **{name: _besides(name, combinations) for name in names}})
         Console().print(_table(table, {name: (None, one) for name, one in found.items()}, seeds))
+        if any(one.final_average is None for tried in found.values() for one in tried):
+            sys.exit(1)
         return
     chosen = _choose(classes, ladder, run)
     Console().print(_table(table, {name: (one.settings, one.tried) for name, one in chosen.items()}, seeds))
@@ -160,7 +163,7 @@ def _write(path: Path, table: str, seeds: Sequence[int], chosen: Mapping[str, Tu
     """Write the chosen settings, and say how `clbench run` gets them unless it reads this file."""
     from clbench.runs.tuning import tuned_file, write_tuned
 
-    with checked_input():
+    with checked_input(), checked_writing(path):
         write_tuned(path, table, seeds, chosen)
     read = tuned_file(table)
     if path.resolve() == read.resolve():

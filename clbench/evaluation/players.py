@@ -5,6 +5,7 @@ Episodes run one after another, or in lock-step if the agent acts on batches.
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
@@ -33,6 +34,8 @@ from clbench.worlds.scenario_env import Observation, ScenarioEnv
 from clbench.worlds.scenario_vector_env import ScenarioVectorEnv
 from clbench.worlds.schedule import InstructionFormat, shown_instruction
 from clbench.worlds.threads import cores
+
+LOG = logging.getLogger(__name__)
 
 
 class Predictor(Interface):
@@ -146,10 +149,18 @@ def play(
             agent of Stable-Baselines3 was trained behind a wrapper that evaluation lacks.
     """
     _check_wrappers(agent, scenario, instruction)
-    act = _act_on_batch if batched else _act
-    count = LANES if batched else 1
-    single = lambda lanes, live: act(agent, lanes, live)[:, None]  # noqa: E731 - chunks of one action
-    return _play(single, scenario, trials, seed, instruction, count)
+    predicted = _act_on_batch if batched else _act
+    count, warned = LANES if batched else 1, False
+
+    def act(lanes: Lanes, live: Sequence[Live]) -> NDArray[np.float32]:
+        nonlocal warned
+        numbers = predicted(agent, lanes, live)
+        if not (warned or np.isfinite(numbers).all()):
+            warned = True
+            LOG.warning("The agent returned NaN or infinities, and NaN counts as 0.")
+        return _within(numbers, _space(lanes, live))[:, None]  # chunks of one action
+
+    return _play(act, scenario, trials, seed, instruction, count)
 
 
 def _check_wrappers(agent: Agent, scenario: Scenario, instruction: InstructionFormat) -> None:
@@ -266,15 +277,15 @@ def _observations(lanes: Lanes, live: Sequence[Live]) -> Iterator[Observation]:
         yield {"state": numbers[row], **picture, "instruction": copy(one.shown)}  # agents may change theirs
 
 
-def _act(agent: Agent, lanes: Lanes, live: Sequence[Live]) -> NDArray[np.float32]:
+def _act(agent: Agent, lanes: Lanes, live: Sequence[Live]) -> NDArray[np.float64]:
     """Return the actions (1, A) of an agent in the only lane, and let it keep its memory."""
     (one,), (observation,) = live, _observations(lanes, live)
     reminder = {} if one.memory is None else {"state": one.memory}
     action, one.memory = _predicted(agent, observation, **reminder)
-    return _checked(action, lanes, live, ())
+    return _numbers("agent", action, _space(lanes, live), ())[None]
 
 
-def _act_on_batch(agent: Agent, lanes: Lanes, live: Sequence[Live]) -> NDArray[np.float32]:
+def _act_on_batch(agent: Agent, lanes: Lanes, live: Sequence[Live]) -> NDArray[np.float64]:
     """Return the actions (lanes, A) of an agent in all lanes; unused rows repeat the first one."""
     rows = list(_observations(lanes, live))
     rows += [rows[0]] * (LANES - len(rows))
@@ -282,7 +293,7 @@ def _act_on_batch(agent: Agent, lanes: Lanes, live: Sequence[Live]) -> NDArray[n
     actions, memory = _predicted(agent, batch)
     if memory is not None:
         raise InputError("The agent has a memory, and cannot act on batches: pass batched=False.")
-    return _checked(actions, lanes, live, (LANES,))[: len(live)]
+    return _numbers("agent", actions, _space(lanes, live), (LANES,))[: len(live)]
 
 
 @dataclass
@@ -377,20 +388,6 @@ def _predicted(agent: Agent, observation: Any, **reminder: Any) -> tuple[Any, An
     return found
 
 
-def _checked(action: Any, lanes: Lanes, live: Sequence[Live], rows: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return actions (N, ..., A) within the space of the running worlds.
-
-    Args:
-        action: What the agent returned.
-        lanes: Running worlds.
-        live: Running episodes.
-        rows: Shape of the actions without A; () for a single action, which becomes (1, A).
-    """
-    space = _space(lanes, live)
-    numbers = _numbers("agent", action, space, rows)
-    return _within(numbers if rows else numbers[None], space)
-
-
 def _space(lanes: Lanes, live: Sequence[Live]) -> spaces.Box:
     """Return the action space of the first lane; all tasks of a scenario share it."""
     space: spaces.Box = lanes.world(live[0].trial.task).single_action_space
@@ -402,7 +399,8 @@ def _numbers(actor: str, action: Any, space: spaces.Box, rows: tuple[int, ...]) 
     shape = (*rows, *space.shape)
     try:
         given = np.asarray(action)
-        if given.dtype.kind in "USc":  # NumPy reads a text as a number, and drops an imaginary part
+        # NumPy reads a text as a number and None in a list as NaN, and drops an imaginary part
+        if given.dtype.kind in "USc" or (given.dtype.kind == "O" and given.ndim):
             raise TypeError(f"of type {given.dtype}")
         numbers = np.asarray(given, np.float64)
     except (TypeError, ValueError) as error:

@@ -55,12 +55,14 @@ def forecast(plan: Plan, runs: Sequence[ResolvedRun], workers: int, checkpoints:
     to_do = ", ".join(counted(count, *words) for words, count in counts.items())
     return [
         f"To do: {to_do}.",
-        _time(plan.jobs, list(scenarios.values()), workers),
+        _time(plan.jobs, runs, list(scenarios.values()), workers),
         _disk(plan.jobs, runs, scenarios, workers, checkpoints),
     ]
 
 
-def _time(jobs: Sequence[Job], scenarios: Sequence[Scenario], at_once: int) -> str:
+def _time(
+    jobs: Sequence[Job], runs: Sequence[ResolvedRun], scenarios: Sequence[Scenario], at_once: int
+) -> str:
     defaults = [one.with_policy(DEFAULT_POLICY) for one in scenarios]
     times = {one: step_seconds(one) for one in dict.fromkeys([*scenarios, *defaults])}  # often the same
     slowest, usual = (max(times[one] for one in some) for some in (scenarios, defaults))
@@ -77,9 +79,10 @@ def _time(jobs: Sequence[Job], scenarios: Sequence[Scenario], at_once: int) -> s
     longest = max(chain_times(jobs, seconds_of).values())
     seconds = max(sum(map(seconds_of, jobs)) / at_once, longest)
     early = any(scenario.budget.criterion for scenario in scenarios)
+    place = "here" if all(run.spec.device == "cpu" for run in runs) else "on this CPU"
     return (
         f"Time: about {_duration(seconds)} with {at_once} at once, at "
-        f"{1000 * slowest:.0f} ms for an optimiser step here"
+        f"{1000 * slowest:.0f} ms for an optimiser step {place}"
         f"{'; a stage ends as soon as its target is learned' if early else ''}."
     )
 
@@ -109,7 +112,7 @@ def _disk(
 
 
 def step_seconds(scenario: Scenario) -> float:
-    """Return the time of an optimiser step of plain fine-tuning here, in seconds, on one thread."""
+    """Return the time of an optimiser step of plain fine-tuning here, in seconds, on one CPU thread."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -252,7 +252,7 @@ def run_specs(firsts: Sequence[RunSpec], seeds: int, records: Path, workers: int
     firsts = [replace(one, scenario=importable(one.scenario)) for one in firsts]
     if any(one.policy.startswith("__main__:") for one in firsts):
         raise InputError("A policy must be in a module: other processes cannot import a class of a notebook.")
-    device = firsts[0].device
+    device, records = firsts[0].device, records.absolute()  # a method of this script may change the folder
     check_device(device)
     specs = [replace(one, seed=one.seed + number) for one in firsts for number in range(seeds)]
     runs = [spec.resolve() for spec in specs]

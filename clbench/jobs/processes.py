@@ -137,7 +137,10 @@ class Processes:
         groups = [worker.process.pid for worker in self._running.values() if worker.process.pid]
         for group in groups:
             signal_group(group, signal.SIGSTOP)
+        begin = time.monotonic()
         os.kill(os.getpid(), signal.SIGSTOP)
+        for worker in self._running.values():
+            worker.started += time.monotonic() - begin  # its limit is of the time that it runs
         for group in groups:
             signal_group(group, signal.SIGCONT)
 
@@ -369,6 +372,8 @@ def _do_job(
         return "taken", str(error)
     except ClbenchError as error:  # its message says all
         return "failed", str(error)
-    except (Exception, KeyboardInterrupt) as error:  # Ctrl-C reaches neither a worker nor a thread
+    except SystemExit:
+        raise
+    except BaseException as error:  # Ctrl-C, for example, reaches neither a worker nor a thread
         return "failed", f"{type(error).__name__}: {error}\n{traceback.format_exc()}"
     return "done", text

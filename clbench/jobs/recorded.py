@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import os
 import platform
@@ -82,6 +81,7 @@ def set_aside(run: ResolvedRun, records: Path) -> str | None:
         A sentence that says what was wrong and where the record is now; None if there is no such record.
 
     Raises:
+        InputError: The record cannot be renamed.
         UnreadableRecordError: A record that may be sound cannot be read now, or by this clbench.
     """
     path = run.path(records)
@@ -101,8 +101,12 @@ def set_aside(run: ResolvedRun, records: Path) -> str | None:
             return None
         fault, ending = f"{' and '.join(changed)} since this run", "old"
     aside = free_name(path, ending)
-    with contextlib.suppress(FileNotFoundError):  # another command was faster
+    try:
         path.replace(aside)
+    except FileNotFoundError:  # another command was faster
+        pass
+    except OSError as error:
+        raise InputError(f"{path}: {fault}, and it cannot be renamed: {error.strerror}.") from error
     return f"{path}: {fault}. The record is renamed to {aside.name}, and the run is repeated."
 
 

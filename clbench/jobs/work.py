@@ -85,6 +85,8 @@ def do_run(
     Raises:
         JobError: The run failed; its record names the place.
     """
+    from clbench.jobs.recorded import has_failed
+    from clbench.records.paths import failed_name
     from clbench.runs.run import execute
     from clbench.scoring.metrics import measure
     from clbench.scoring.scores import WEAK, Scores
@@ -92,9 +94,10 @@ def do_run(
     run = spec.resolve()
     record = execute(run, records, progress, checkpoints=checkpoints, tensorboard=tensorboard)
     if record.error is not None:
-        raise JobError(
-            shortened(f"failed in {record.failure}", run.path(records).relative_to(records).as_posix())
-        )
+        path = run.path(records)
+        if not has_failed(run, records):  # a record that stays is there, see `write_result`
+            path = failed_name(path)
+        raise JobError(shortened(f"failed in {record.failure}", path.relative_to(records).as_posix()))
     scores = Scores.from_record(record)
     perturbed = ["perturbed_retention"] if spec.perturb else []
     names = ["adaptation", "retention", *perturbed, "question_retention"]

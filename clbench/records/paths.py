@@ -98,6 +98,11 @@ def stage_folder(root: Path, number: int) -> Path:
     return root / f"stage-{number}"
 
 
+def failed_name(path: Path) -> Path:
+    """Return the path of the record of a failed run beside a record that stays: "seed-0.json.failed"."""
+    return path.with_name(f"{path.name}.failed")
+
+
 def free_name(path: Path, ending: str) -> Path:
     """Return a free path next to a record, to set it aside: "seed-0.json.old", or the same with a number.
 

@@ -13,7 +13,7 @@ from clbench.base.errors import InputError
 from clbench.base.leftovers import replacing
 from clbench.base.strict_json import LONGEST_TEXT, check_json
 from clbench.records.content import content_hash
-from clbench.records.paths import free_name
+from clbench.records.paths import failed_name, free_name
 from clbench.records.reader import RecordError, UnreadableRecordError, read_record
 from clbench.records.record import SCHEMA, Record
 
@@ -41,16 +41,21 @@ def write_record(record: Record, path: Path) -> None:
     text = record_text(record)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as partial:
-        with open(partial, "x", encoding="utf-8", newline="\n") as file:
-            file.write(text)
+        try:
+            with open(partial, "x", encoding="utf-8", newline="\n") as file:
+                file.write(text)
+        except OSError as error:
+            error.filename = str(path)  # a full disk names no file
+            raise
         _check_readable(partial)
 
 
 def write_result(record: Record, path: Path) -> None:
     """Write the record of a run, but lose no record of a run that succeeded, or may have succeeded.
 
-    If this run failed, such a record stays in its place. If it has other settings, another budget or another
-    device, its file is kept next to the new one, with the ending ".old". An equal run replaces it.
+    If this run failed, such a record stays in its place, and the new one lies next to it, with the ending
+    ".failed". If it has other settings, another budget or another device, its file is kept next to the new
+    one, with the ending ".old". An equal run replaces it.
 
     Raises:
         InputError: As for `write_record`.
@@ -63,7 +68,12 @@ def write_result(record: Record, path: Path) -> None:
     except RecordError:
         is_kept = is_other = False
     if is_kept and record.status == "failed":
-        LOG.warning("%s stays: its run succeeded, or may have succeeded, and the new run failed.", path)
+        aside = failed_name(path)
+        write_record(record, aside)
+        LOG.warning(
+            "%s stays: its run succeeded, or may have succeeded. The new run failed: its record is %s.",
+            *(path, aside.name),
+        )
         return
     if is_kept and is_other:
         aside = free_name(path, "old")

@@ -36,6 +36,7 @@ from clbench.records.record import ONLINE_USES, AnswerRow, Record, RunInfo
 from clbench.records.writer import write_record
 from clbench.runs.fingerprint import describe_agent, fingerprint
 from clbench.runs.spec import describe_scenario
+from clbench.runs.stages import machine_needed
 from clbench.spec.fields import is_whole, whole_number
 from clbench.spec.identifiers import built_in_methods, check_method_name
 from clbench.spec.protocol import FIRST_TUNING_SEED, LARGEST_SEED, Protocol, ScoredSplit
@@ -97,7 +98,7 @@ def evaluate_agent(
             trained behind a wrapper that changes observations or actions, or the name, the seed, the steps
             or the settings are invalid.
         RecordError: The record of the earlier stages cannot be read.
-        LeaseLostError: Another program took over the run, or the file of its lease was removed.
+        LeaseLostError, MachineError: The run was taken over, or its lease removed; no record can be written.
     """
     training = training_of(env)
     scenario, stage = training.scenario, training.stage
@@ -421,15 +422,14 @@ class StagedRun:
         """Write the record: beside its final path, or after the last stage to that path, which ends the run.
 
         Raises:
-            LeaseLostError: As for `begin`; the stage is not kept.
+            LeaseLostError, MachineError: As for `begin`, or it cannot be written. The stage is not kept.
         """
         self._check_lease()
-        if stage < self.last:
-            write_record(record, self.unfinished)
-            return
-        write_record(record, self.path)
-        self.unfinished.unlink(missing_ok=True)
-        self._release()
+        with machine_needed():
+            write_record(record, self.unfinished if stage < self.last else self.path)
+        if stage == self.last:
+            self.unfinished.unlink(missing_ok=True)
+            self._release()
 
     def _release(self) -> None:
         if lease := _LEASES.pop(self.unfinished, None):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import itertools
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -232,7 +233,9 @@ class Film:
         frames = (
             self.frame(time).quantize(palette=palette, dither=Image.Dither.NONE) for time in range(len(self))
         )
-        milliseconds = [round(100 / fps) * 10] * (len(self) - 1) + [round(1000 * HOLD_SECONDS)]
+        starts = [round(100 * time / fps) for time in range(len(self))]  # in hundredths of a second
+        milliseconds = [10 * (end - start) for start, end in itertools.pairwise(starts)]
+        milliseconds.append(round(1000 * HOLD_SECONDS))
         next(frames).save(path, "GIF", save_all=True, append_images=frames, duration=milliseconds, loop=0)
 
     def _palette(self) -> Image.Image:

@@ -90,7 +90,8 @@ def execute(
             under_way = _Run.start(resolved, folder, lease, progress, kept, log)
             record = under_way.go()
         lease.check()
-        write_result(record, path)
+        with machine_needed():
+            write_result(record, path)
         under_way.forget()
     return record
 

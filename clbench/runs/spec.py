@@ -241,6 +241,8 @@ def check_device(device: str) -> None:
             raise InputError(
                 f"The device {device!r} cannot be used: runs are reproducible only on cpu and cuda."
             )
+        if found.type == "cpu" and found.index is not None:
+            raise InputError(f"The device {device!r} cannot be used: write 'cpu'.")
         if found.type == "cuda" and (found.index or 0) < torch.cuda.device_count():
             return  # a tensor there would create a context, which keeps workers off a GPU in exclusive mode
         torch.zeros(1, device=device)

@@ -5,7 +5,13 @@ from pathlib import Path
 import pytest
 
 from clbench.base.errors import InputError
-from clbench.cli.arguments import add_cwd_to_path, checked_input, checked_writing
+from clbench.cli.arguments import (
+    add_cwd_to_path,
+    checked_input,
+    checked_writing,
+    error_line,
+    items_of,
+)
 from clbench.cli.main import app
 
 
@@ -16,6 +22,14 @@ def test_a_file_that_does_not_fit_on_the_disk_is_named() -> None:
         checked_writing(full),
     ):
         full.write_text("a film")
+
+
+def test_an_error_is_one_line_with_the_spaces_of_its_names() -> None:
+    assert error_line("a  file\n  is gone\n").plain == "error: a  file is gone"
+
+
+def test_a_comma_inside_brackets_separates_no_items() -> None:
+    assert items_of("--values.layers", "[1,2], none,[3]") == ["[1,2]", "none", "[3]"]
 
 
 def test_a_working_directory_that_is_gone_is_named(
@@ -141,10 +155,14 @@ def test_a_path_may_begin_with_the_home_folder(
             "/proc/x cannot be written",
         ),
         (["status", "--seeds", "99"], "--seeds needs a scenario: name the scenario"),
+        (["status", "--order", "0"], "--order needs a scenario: name the scenario"),
+        (["status", "clbench/Fetch-v1", "--seeds", "4"], "Name at least one method"),
+        (["status", "clbench/Fetch-v1", "sft", "--seeds", "0"], "Must be >= 1."),
         (["list", "foo"], "list does not take 'foo': see clbench list --help."),
         (["claims", "--records", "nowhere"], "There is no folder of records at nowhere."),
         (["findings", "--records", "nowhere"], "There is no folder of records at nowhere."),
         (["metrics", "forgeting"], "No metric is called 'forgeting'. Did you mean 'forgetting'?"),
+        (["metrics", "--json", "--markdown", "m.md"], "--markdown writes a page, and --json prints JSON"),
         (["metrics", "rates.txt"], "There is no file 'rates.txt'."),
         (["metrics", "/"], "'/' is a folder, not a file."),
         (["leaderbord"], "No command is called 'leaderbord'. Did you mean 'leaderboard'?"),

@@ -147,6 +147,15 @@ def test_output_that_goes_nowhere_shows_no_traceback(output: str, code: int, err
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("number", [1, 2])
+def test_the_number_of_a_closed_output_goes_to_no_file_and_children_have_it_too(number: int) -> None:
+    taken = f"os.open(os.devnull, os.O_RDONLY) > 2 and os.get_inheritable({number})"
+    program = f"import clbench.cli.main as m, os, sys; m.main = lambda: sys.exit(3 if {taken} else 4); {RUN}"
+    command = ["sh", "-c", f'exec "$0" -c "$1" {number}>&-', sys.executable, program]
+    assert subprocess.run(command, stderr=subprocess.DEVNULL, check=False).returncode == 3
+
+
+@pytest.mark.long
 def test_a_reader_that_leaves_ends_the_command_without_a_traceback() -> None:
     program = f"import clbench.cli.main as m, sys; m.main = lambda: print('x' * 10**6); {RUN}"
     process = subprocess.Popen(

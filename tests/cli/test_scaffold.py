@@ -266,6 +266,7 @@ def test_a_full_disk_names_the_file_and_leaves_none(tmp_path: Path, monkeypatch:
         ("mine.py", "Did you mean 'mine_py'?"),
         ("m" * 51, "at most 50 lowercase letters"),
         ("lambda", "'lambda' is a Python keyword"),
+        ("none", "'None' is a Python keyword. Did you mean 'none_method'?"),
         ("sft", "'sft' is a built-in method. Did you mean 'my_sft'?"),
         ("s_f_t", "would take for 'sft'"),
         ("nul", "the name of a device on Windows"),

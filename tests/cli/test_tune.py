@@ -1,7 +1,9 @@
 """The command `clbench tune`; its refusals are among those of test_main.py."""
 
 import dataclasses
+import errno
 import json
+import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import ClassVar
@@ -192,3 +194,39 @@ def test_the_best_mean_over_the_seeds_is_refined_and_chosen(
     assert [one["final_average"] for one in found["tried"]] == pytest.approx(finals, abs=1e-4)
     assert {one["learned"] for one in found["tried"]} == {0.9}
     assert found["settings"] == {"strength": 1.0, "step_factor": 0.3}
+
+
+def test_a_file_of_settings_that_does_not_fit_on_the_disk_is_named(
+    make_record: Callable[..., Record],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def do_runs(runs: Iterable[ResolvedRun], records: Path, workers: object) -> bool:
+        for run in runs:
+            success = [[1, 1, 0, 0, 0], [1, 1, 0.9, 0, 0], [1, 1, 1, 0.9, 0]]
+            record = make_record(success, steps=(100,), episodes=10, split="validation", seed=run.spec.seed)
+            write_record(record, run.path(records))
+        return True
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(".")
+    monkeypatch.setattr("clbench.cli.tune.do_runs", do_runs)
+    monkeypatch.setattr("clbench.runs.tuning.write_tuned", full)
+    with pytest.raises(SystemExit, match="2"):
+        app(["tune", TINY, "l2_sp", "--seeds", "1", "--write", "tuned.json"])
+    assert "error: tuned.json cannot be written: No space left on device." in capsys.readouterr().err
+
+
+@pytest.mark.long
+def test_a_comparison_with_a_failed_setting_shows_it_and_ends_with_exit_code_1(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(".")
+    with pytest.raises(SystemExit, match="1"):
+        app(["tune", TINY, f"{__name__}:Hopeless", "--seeds", "1", "--values.step_factor", "1"])
+    assert "failed" in capsys.readouterr().out

@@ -49,6 +49,13 @@ def test_the_time_is_that_of_all_jobs_shared_by_the_workers(
     assert time == f"Time: {words}, at 72 ms for an optimiser step here."
 
 
+def test_the_time_of_runs_on_a_gpu_is_said_to_be_that_of_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "step_seconds", lambda _: 0.06)
+    runs = [RunSpec(TINY.id, "sft", 0, device="cuda").resolve()]
+    _, time, _ = forecast(_plan(_job(work.do_run, 1000)), runs, 1, None)
+    assert time == "Time: about 1 minute with 1 at once, at 60 ms for an optimiser step on this CPU."
+
+
 def test_more_workers_do_not_shorten_the_longest_chain(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "step_seconds", lambda _: 0.06)
     pretraining = _job(work.pretrain, 3000)

@@ -2,11 +2,13 @@
 
 import importlib
 import io
+import os
 import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ import gymnasium
 import numpy as np
 import pytest
 from rich.console import Console
+from torch import nn
 
 import clbench
 from clbench.base.errors import ClbenchError
@@ -22,6 +25,8 @@ from clbench.jobs.grid import missing, run_missing
 from clbench.jobs.job import Job
 from clbench.jobs.processes import Here
 from clbench.jobs.scheduler import run_with_bars
+from clbench.learning.method import Stage
+from clbench.policy.policy import Policy
 from clbench.runs.run import execute
 from clbench.runs.spec import ResolvedRun, RunSpec
 from clbench.runs.stages import has_stages, keep_stages
@@ -127,6 +132,24 @@ def test_a_method_that_changes_the_folder_leaves_its_record_where_it_was_asked_f
     (record,) = clbench.run(TINY, "moving:Slow", seeds=1, records="records", workers=1)
     assert record.status == "success"
     assert (tmp_path / "records/me--Tiny-v0/moving.Slow/seed-0.json").is_file()
+
+
+@pytest.mark.long
+def test_a_class_of_the_script_that_changes_the_folder_leaves_its_record_where_it_was_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @dataclass
+    class Moving(clbench.Method):
+        def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
+            os.chdir("/")
+            return policy.parameters()
+
+    Moving.__module__, Moving.__qualname__ = "__main__", "Moving"
+    monkeypatch.setattr(sys.modules["__main__"], "Moving", Moving, raising=False)
+    monkeypatch.chdir(tmp_path)
+    (record,) = clbench.run(TINY, Moving, seeds=1, records="records")
+    assert record.status == "success"
+    assert (tmp_path / "records/me--Tiny-v0/__main__.Moving/seed-0.json").is_file()
 
 
 def test_runs_that_failed_are_not_counted_and_neither_are_the_jobs_that_they_share(

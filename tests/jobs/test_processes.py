@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,10 +21,11 @@ from clbench.jobs.bars import Bars
 from clbench.jobs.job import Job, Product
 from clbench.jobs.processes import Here, Processes, at_once
 from clbench.jobs.scheduler import run_jobs
+from clbench.spec.limits import Limits
 from clbench.worlds.threads import cores
 
 JOBS = """
-import multiprocessing, os, signal, subprocess, time
+import asyncio, multiprocessing, os, signal, subprocess, time
 from pathlib import Path
 
 def leaves_a_child(progress, path):
@@ -63,6 +65,15 @@ def ends_by(progress, number):
 
 def interrupts(progress):
     raise KeyboardInterrupt("of its own")
+
+def cancels(progress):
+    raise asyncio.CancelledError("of its own")
+
+def waits_for(progress, begun, end):
+    Path(begun).touch()
+    while not Path(end).exists():
+        time.sleep(0.05)
+    return "went well"
 
 def moves(progress, folder):
     from clbench.base.cache import cache_folder, minari_folder
@@ -130,11 +141,14 @@ def test_a_job_may_start_processes_of_its_own(bars: Bars) -> None:
 
 
 @pytest.mark.parametrize("workers", [Processes, Here])
-def test_a_keyboard_interrupt_that_a_job_raises_is_its_failure(
-    workers: Callable[[], Processes | Here], bars: Bars
+@pytest.mark.parametrize(
+    ("function", "error"), [("interrupts", "KeyboardInterrupt"), ("cancels", "CancelledError")]
+)
+def test_an_interrupt_or_a_cancellation_that_a_job_raises_is_its_failure(
+    function: str, error: str, workers: Callable[[], Processes | Here], bars: Bars
 ) -> None:
-    (reason,) = run_jobs([_job("interrupts")], workers(), bars).values()
-    assert reason.startswith("KeyboardInterrupt: of its own")
+    (reason,) = run_jobs([_job(function)], workers(), bars).values()
+    assert reason.startswith(f"{error}: of its own")
 
 
 def test_a_job_that_moves_finds_the_folders_of_data_where_they_were(
@@ -206,6 +220,39 @@ def test_ctrl_z_stops_the_workers_with_the_command_and_they_go_on_with_it(
         command.kill()
         command.wait()
     assert _is_gone(processes[1])
+
+
+def test_the_time_for_which_a_command_is_stopped_does_not_count_for_a_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kill, stopped = os.kill, 0
+
+    def stop(process: int, number: int) -> None:
+        nonlocal stopped
+        if process == os.getpid():
+            stopped += 7200
+        else:
+            kill(process, number)
+
+    begun, end = tmp_path / "begun", tmp_path / "end"
+    limits = Limits(seconds=3600)
+    signal.signal(signal.SIGTSTP, signal.SIG_DFL)  # workers of another test may not have been closed
+    workers = Processes(1)
+    suspend = signal.getsignal(signal.SIGTSTP)
+    workers.start(dataclasses.replace(_job("waits_for", begun=begun, end=end), limits=limits))
+    while not begun.exists():
+        time.sleep(0.05)
+    clock = types.SimpleNamespace(monotonic=lambda: time.monotonic() + stopped)
+    monkeypatch.setattr("clbench.jobs.processes.time", clock)
+    monkeypatch.setattr("os.kill", stop)
+    assert callable(suspend)
+    suspend(signal.SIGTSTP, None)
+    events = list(workers.events())  # it looks at the limits first
+    end.touch()
+    while not any(event.ends_job for event in events):
+        events += workers.events()
+    workers.close()
+    assert (stopped, events[-1].kind, events[-1].value) == (7200, "done", "went well")
 
 
 def _read_number(path: Path) -> int:

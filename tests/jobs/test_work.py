@@ -8,6 +8,7 @@ import pytest
 from eager import EAGER
 from tiny import TINY
 
+from clbench.cli.status import found_runs
 from clbench.jobs.job import JobError
 from clbench.jobs.work import (
     collect_demonstrations,
@@ -16,8 +17,10 @@ from clbench.jobs.work import (
     evaluate_policy,
     pretrain,
 )
+from clbench.records.paths import failed_name
 from clbench.records.reader import read_record
 from clbench.records.record import Record
+from clbench.records.writer import write_record
 from clbench.runs.spec import RunSpec
 
 WORDY = """
@@ -79,3 +82,24 @@ def test_a_long_message_is_cut_where_it_is_said_and_whole_in_the_record(
     error = read_record(spec.path(tmp_path)).error
     assert error is not None
     assert error["message"] == "x" * 3000
+
+
+def test_a_failure_beside_a_success_is_kept_whole_and_named_and_is_no_run_of_its_own(
+    tmp_path: Path, write_module: Callable[[str, str], None], make_record: Callable[..., Record]
+) -> None:
+    write_module("wordy_too", WORDY)
+    spec = RunSpec(SPEC.scenario, "wordy_too:Wordy", 0)
+    path = spec.path(tmp_path)
+    success = make_record([[1.0, 0.0], [1.0, 1.0]])
+    write_record(success, path)
+    for _ in range(2):
+        with pytest.raises(JobError) as failed:
+            do_run(spec, tmp_path, lambda _: None)
+        assert str(failed.value).endswith("x [... Toy-v0/wordy_too.Wordy/seed-0.json.failed has the rest]")
+    assert read_record(path) == success
+    aside = failed_name(path)
+    error = read_record(aside).error
+    assert error is not None
+    assert 'raise ValueError("x" * 3000)' in error["traceback"]
+    assert found_runs(tmp_path) == [path]
+    assert sorted(path.parent.iterdir()) == [path, aside]

@@ -11,9 +11,11 @@ import pytest
 import torch
 from agents import ID, LEARNED, TOY, Knowing, stage_env, trained
 
+from clbench.base.errors import InputError
 from clbench.policy.transformer import TransformerPolicy
 from clbench.records.reader import read_record
 from clbench.records.record import Costs
+from clbench.runs.stages import MachineError
 from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
 from clbench.worlds.scenario_env import Observation
@@ -363,3 +365,31 @@ def test_an_environment_without_a_scenario_or_a_stage_is_refused(evaluate: Calla
             evaluate(Knowing(), env)
     with pytest.raises(ValueError, match=r"goes through all stages: .*'clbench/Toy-v0', stage=0\)"):
         evaluate(Knowing(), gymnasium.make(ID))
+
+
+def test_a_record_of_an_agent_that_does_not_fit_on_the_disk_is_named(
+    evaluate: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> Any:
+        return open("/dev/full", "w")
+
+    monkeypatch.setattr("clbench.records.writer.open", full, raising=False)
+    path = tmp_path / "records" / "Toy-v0" / "me--knows" / "seed-0.json.unfinished"
+    with pytest.raises(MachineError, match=f"has no room: .*No space left on device: '{path}'"):
+        evaluate(Knowing(), stage_env(0))
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_an_agent_whose_actions_are_not_finite_is_named_once(
+    batched: bool, evaluate: Callable[..., Any], caplog: pytest.LogCaptureFixture
+) -> None:
+    actions = np.full((40, 2) if batched else 2, np.nan)
+    agent = type("Diverged", (), {"predict": lambda *_, **__: (actions, None)})()
+    evaluate(agent, stage_env(0, instruction="tokens"), batched=batched)
+    assert caplog.messages == ["The agent returned NaN or infinities, and NaN counts as 0."]
+
+
+def test_an_agent_that_returns_nothing_in_a_list_is_refused(evaluate: Callable[..., Any]) -> None:
+    with pytest.raises(InputError, match=r"must be 2 numbers, not a list \(of type object\)"):
+        evaluate(lambda _: [None] * 2, stage_env(0))

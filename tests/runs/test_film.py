@@ -130,6 +130,22 @@ def test_a_gif_has_every_step_and_holds_its_last_frame(drawn: Film, tmp_path: Pa
     assert durations == [50, 50, 50, 50, 2000]
 
 
+def test_a_gif_has_the_speed_that_was_asked_for(drawn: Film, tmp_path: Path) -> None:
+    drawn.save(tmp_path / "film.gif", 40)
+    with Image.open(tmp_path / "film.gif") as gif:
+        durations = []
+        for number in range(5):
+            gif.seek(number)
+            durations.append(gif.info["duration"])
+    assert durations == [
+        20,
+        30,
+        30,
+        20,
+        2000,
+    ]  # a GIF counts in hundredths of a second; four steps take 0.1 s
+
+
 @pytest.mark.long
 @pytest.mark.skipif(find_spec("imageio_ffmpeg") is None, reason="the extra film is not installed")
 def test_an_mp4_has_every_step_and_holds_its_last_frame(drawn: Film, tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from tiny import TINY
 from clbench.base import lease as leases
 from clbench.base.cache import CacheError, cache_folder
 from clbench.base.entry_points import resolve
+from clbench.base.errors import InputError
 from clbench.base.lease import LeaseLostError
 from clbench.jobs.recorded import has_record, has_settings_of, set_aside
 from clbench.learning.method import Method
@@ -313,6 +314,7 @@ def test_a_run_that_fails_leaves_a_good_record_of_another_configuration_alone(
     assert record.status == "failed"
     assert spec.path(tmp_path).read_bytes() == before
     assert "stays: its run succeeded" in caplog.text
+    assert "its record is seed-0.json.failed." in caplog.text
 
 
 @pytest.mark.long
@@ -396,6 +398,39 @@ def test_records_that_are_set_aside_one_after_the_other_all_stay(tmp_path: Path)
         assert set_aside(spec.resolve(), tmp_path) is not None
     names = (f"{path.name}.damaged{number}" for number in ("", "1", "2"))
     assert [path.with_name(name).read_text() for name in names] == ["first", "second", "third"]
+
+
+def test_a_damaged_record_that_cannot_be_renamed_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    spec = RunSpec(TOY, "frozen", seed=0, targets=1)
+    path = spec.path(tmp_path)
+    path.parent.mkdir(parents=True)
+    path.write_text("{")
+    monkeypatch.setattr("pathlib.Path.replace", refuse)
+    with pytest.raises(InputError, match=rf"^{path}: .*, and it cannot be renamed: Permission denied\.$"):
+        set_aside(spec.resolve(), tmp_path)
+
+
+def test_a_record_that_does_not_fit_on_the_disk_is_named_and_its_run_goes_on_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, *arguments: Any, **options: Any) -> Any:
+        is_record = path.is_relative_to(tmp_path)  # those of the checkpoints are in the cache
+        return open("/dev/full", "w") if is_record else open(path, *arguments, **options)
+
+    spec = RunSpec(TINY.id, "frozen", seed=0, targets=1)
+    monkeypatch.setattr("clbench.records.writer.open", full, raising=False)
+    with pytest.raises(
+        MachineError, match=rf"has no room: .* on device: '{spec.path(tmp_path)}'\. The method"
+    ):
+        execute(spec, tmp_path)
+    assert not list(tmp_path.rglob("*.json"))
+    monkeypatch.undo()
+    assert execute(spec, tmp_path).timing["resumed_after"] == 1
 
 
 def test_a_run_that_lost_its_lease_at_the_end_writes_no_record(

@@ -130,6 +130,11 @@ def test_an_impossible_run_is_refused_where_it_is_built(fields: dict[str, Any], 
         RunSpec(**{"scenario": TOY, "method": "sft", "seed": 0, **fields})
 
 
+def test_a_cpu_has_no_number() -> None:  # its runs would count as those of another device
+    with pytest.raises(InputError, match=r"The device 'cpu:0' cannot be used: write 'cpu'\."):
+        check_device("cpu:0")
+
+
 @pytest.mark.parametrize(("device", "touched"), [("cuda", False), ("cuda:1", False), ("cuda:7", True)])
 def test_a_gpu_that_exists_is_left_to_the_workers(
     monkeypatch: pytest.MonkeyPatch, device: str, touched: bool
