@@ -101,7 +101,14 @@ def items_of(option: str, text: str) -> list[str]:
     Raises:
         InputError: An item is empty.
     """
-    items = [item.strip() for item in re.split(r",(?![^[]*])", text)]
+    depth, items = 0, [""]
+    for sign in text:
+        depth += (sign == "[") - (sign == "]")
+        if sign == "," and depth <= 0:
+            items.append("")
+        else:
+            items[-1] += sign
+    items = [item.strip() for item in items]
     if "" in items:
         raise InputError(f"{option} has an empty item: {text!r}. Separate items with single commas.")
     return list(dict.fromkeys(items))

@@ -32,7 +32,6 @@ from clbench.cli.runs import requested
 from clbench.records.paths import RECORDS
 from clbench.records.reader import RecordError, UnreadableRecordError, check_home, read_record
 from clbench.spec.identifiers import check_known, folder_name, without_module
-from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.protocol import DEFAULT_SEEDS
 
 if TYPE_CHECKING:
@@ -123,8 +122,9 @@ def status(
         if methods or given:
             from clbench.runs.spec import RunSpec
 
-            first = RunSpec("", "", first_seed or 0, changes or {}, device or "cpu", perturb=perturb)
-            first = replace(first, order=order or 0, policy=policy or DEFAULT_POLICY)
+            first = RunSpec("", "", first_seed or 0, changes or {}, order=order or 0, perturb=perturb)
+            first = first if device is None else replace(first, device=device)
+            first = first if policy is None else replace(first, policy=policy)
             runs = requested(ids, methods, every, seeds or DEFAULT_SEEDS, first, records)
             states = [run_state(run.path(records), run) for run in runs]
         else:

@@ -65,11 +65,11 @@ def from_matrix(
     """Return every metric that a success matrix allows, and the reasons why the others have no value.
 
     Args:
-        matrix: Success rates, (stages, tasks) or (seeds, stages, tasks), NaN or masked where missing; or
-            several such arrays by the name of the method. Row k is the end of stage k, in which target k is
-            learned. If there is one row more than targets, the first row is stage 0, before the first target.
-            The metric gain compares each seed with the same one of a method called sft, and intransigence
-            with that of one called joint.
+        matrix: Success rates, (stages, tasks) or (seeds, stages, tasks), NaN where missing, or a masked
+            array; or several such arrays by the name of the method. Row k is the end of stage k, in which
+            target k is learned. If there is one row more than targets, the first row is stage 0, before the
+            first target. The metric gain compares each seed with the same one of a method called sft, and
+            intransigence with that of one called joint.
         tasks: Names of the columns, by default "task 1", "task 2" and so on.
         retained: Names of the tasks that are known before the first target and never trained again; a
             single string is one name, here and below.

@@ -54,8 +54,8 @@ def write_result(record: Record, path: Path) -> None:
     """Write the record of a run, but lose no record of a run that succeeded, or may have succeeded.
 
     If this run failed, such a record stays in its place, and the new one lies next to it, with the ending
-    ".failed". If it has other settings, another budget or another device, its file is kept next to the new
-    one, with the ending ".old". An equal run replaces it.
+    ".failed", until a run succeeds. If it has other settings, another budget or another device, its file is
+    kept next to the new one, with the ending ".old". An equal run replaces it.
 
     Raises:
         InputError: As for `write_record`.
@@ -83,6 +83,7 @@ def write_result(record: Record, path: Path) -> None:
             "%s had other settings, another budget or another device: it is kept as %s.", path, aside.name
         )
     write_record(record, path)
+    failed_name(path).unlink(missing_ok=True)
 
 
 def _holds(record: Record, before: Record) -> bool:

@@ -30,6 +30,7 @@ def test_an_error_is_one_line_with_the_spaces_of_its_names() -> None:
 
 def test_a_comma_inside_brackets_separates_no_items() -> None:
     assert items_of("--values.layers", "[1,2], none,[3]") == ["[1,2]", "none", "[3]"]
+    assert items_of("--values.layers", "[[1,2],[3]],[[4]]") == ["[[1,2],[3]]", "[[4]]"]
 
 
 def test_a_working_directory_that_is_gone_is_named(
@@ -157,6 +158,7 @@ def test_a_path_may_begin_with_the_home_folder(
         (["status", "--seeds", "99"], "--seeds needs a scenario: name the scenario"),
         (["status", "--order", "0"], "--order needs a scenario: name the scenario"),
         (["status", "clbench/Fetch-v1", "--seeds", "4"], "Name at least one method"),
+        (["status", "clbench/Fetch-v1", "sft", "--policy", ""], "No policy is called ''"),
         (["status", "clbench/Fetch-v1", "sft", "--seeds", "0"], "Must be >= 1."),
         (["list", "foo"], "list does not take 'foo': see clbench list --help."),
         (["claims", "--records", "nowhere"], "There is no folder of records at nowhere."),

@@ -20,7 +20,7 @@ from clbench.jobs.work import (
 from clbench.records.paths import failed_name
 from clbench.records.reader import read_record
 from clbench.records.record import Record
-from clbench.records.writer import write_record
+from clbench.records.writer import write_record, write_result
 from clbench.runs.spec import RunSpec
 
 WORDY = """
@@ -103,3 +103,5 @@ def test_a_failure_beside_a_success_is_kept_whole_and_named_and_is_no_run_of_its
     assert 'raise ValueError("x" * 3000)' in error["traceback"]
     assert found_runs(tmp_path) == [path]
     assert sorted(path.parent.iterdir()) == [path, aside]
+    write_result(success, path)
+    assert sorted(path.parent.iterdir()) == [path]

@@ -393,3 +393,4 @@ def test_an_agent_whose_actions_are_not_finite_is_named_once(
 def test_an_agent_that_returns_nothing_in_a_list_is_refused(evaluate: Callable[..., Any]) -> None:
     with pytest.raises(InputError, match=r"must be 2 numbers, not a list \(of type object\)"):
         evaluate(lambda _: [None] * 2, stage_env(0))
+    evaluate(lambda _: np.array([0.1, 0.2], object), stage_env(0))  # a row of a table, for example

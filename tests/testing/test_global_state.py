@@ -48,6 +48,7 @@ def test_the_compiled_form_of_an_imported_module_does_not_count(
     Path(tmp_path, "imported_in_a_hook.py").write_text("value = 1\n", encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr("sys.dont_write_bytecode", False)
+    monkeypatch.setattr("sys.pycache_prefix", None)
     found: list[str] = []
     with watched(found, generators=False):
         __import__("imported_in_a_hook")
