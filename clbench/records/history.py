@@ -1,6 +1,6 @@
 """Records of older schemas, converted to the present one while they are read. Their files stay as they are.
 
-Schema 4 knew one kind of policy.
+Schema 4 knew one kind of policy. The world and the camera of FetchPixels were in other modules.
 
 Schema 3 did not measure how often the latest target captures the instructions of other skills.
 
@@ -45,6 +45,12 @@ COSTS = (
 
 POLICY = ("stage", "step", "update_sparsity", "activation_drift")
 """Columns of the table of changes of the policy in schema 2."""
+
+MOVED = {
+    "clbench.envs.fetch.pixel_world:FetchPixelsWorld": "clbench.envs.fetch_pixels.world:FetchPixelsWorld",
+    "clbench.envs.fetch.camera:FetchCamera": "clbench.envs.fetch_pixels.camera:FetchCamera",
+}
+"""Names of a world and a camera up to schema 4, with their present names."""
 
 _Values = dict[str, Any]
 
@@ -154,7 +160,10 @@ def _from_4(values: _Values) -> _Values:
     if run is not None:
         _refuse_later("run", run, ("policy",), 4)
         run["policy"] = "flow"
-    return _with(values, {"run": run})
+    fingerprint = _part(values, "fingerprint")
+    if fingerprint is not None and (rollouts := _part(fingerprint, "rollouts")) is not None:
+        fingerprint["rollouts"] = {MOVED.get(name, name): value for name, value in rollouts.items()}
+    return _with(values, {"run": run, "fingerprint": fingerprint})
 
 
 _STEPS: tuple[Callable[[_Values], _Values], ...] = (_from_1, _from_2, _from_3, _from_4)
