@@ -400,7 +400,8 @@ def _numbers(actor: str, action: Any, space: spaces.Box, rows: tuple[int, ...]) 
     try:
         given = np.asarray(action)
         # NumPy reads a text as a number and None in a list as NaN, and drops an imaginary part
-        if given.dtype.kind in "USc" or (given.ndim and None in given.ravel().tolist()):
+        is_object = given.dtype.kind == "O" and given.ndim
+        if given.dtype.kind in "USc" or (is_object and any(one is None for one in given.flat)):
             raise TypeError(f"of type {given.dtype}")
         numbers = np.asarray(given, np.float64)
     except (TypeError, ValueError) as error:
