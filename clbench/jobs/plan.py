@@ -13,11 +13,17 @@ from clbench.evaluation.definition import recording_of
 from clbench.jobs import work
 from clbench.jobs.job import Job, Product
 from clbench.jobs.recorded import has_failed, has_record
-from clbench.learning.pretraining import is_pretrained, vision_steps
+from clbench.learning.pretraining import is_pretrained
 from clbench.learning.watching import watches
 from clbench.policy.kinds import policy_class
 from clbench.records.paths import table_name
-from clbench.runs.length import point_length, run_length, training_length, watching_length
+from clbench.runs.length import (
+    point_length,
+    pretraining_length,
+    run_length,
+    training_length,
+    watching_length,
+)
 from clbench.runs.spec import ResolvedRun
 from clbench.runs.start import is_evaluated, starts_as_pretrained
 from clbench.spec.budget import Budget
@@ -202,11 +208,10 @@ class Plan:
         return (*((policy,) if policy else ()), *dict.fromkeys(data))
 
     def _pretraining(self, name: str, scenario: Scenario, seed: int) -> Job:
-        steps = scenario.budget.pretraining_steps + vision_steps(scenario)
         needs = self.add_pretraining_data(name, scenario)
         title = _title(name, f"pretraining seed {seed}", scenario.policy)
         arguments = {"scenario": name, "policy": scenario.policy, "seed": seed}
-        return Job(title, work.pretrain, arguments, steps, needs)
+        return Job(title, work.pretrain, arguments, pretraining_length(scenario), needs)
 
     def _start(self, run: ResolvedRun) -> Job | None:
         """Return the job that evaluates the start of a run, None if the cache has the evaluation."""

@@ -23,6 +23,13 @@ def run_length(scenario: Scenario, protocol: Protocol) -> float:
     return training_length(scenario) + evaluation + relearning_length(protocol)
 
 
+def pretraining_length(scenario: Scenario) -> float:
+    """Return the length of pretraining a policy; if it sees pictures, its vision is pretrained before it."""
+    from clbench.learning.pretraining import vision_steps
+
+    return float(scenario.budget.pretraining_steps + vision_steps(scenario))
+
+
 def watching_length(method: type[Method], scenario: Scenario) -> float:
     """Return the length of the pretraining repeated for a method that watches it, 0 for other methods."""
     from clbench.learning.watching import watches

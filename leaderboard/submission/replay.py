@@ -56,7 +56,7 @@ def replay(subject: Subject, progress: ProgressCallback) -> list[Check]:
         return [Check("policies", str(error), None)]
     processors = subject.other_processor
     tried = processors is None or subject.request.any_processor
-    if not tried or not _same_pretraining(subject):
+    if not tried or not _same_pretraining(subject, progress):
         what = "pretraining" if tried else "training"
         elsewhere = f" ({processors})" if processors else ""
         anyway = "" if tried else ", or try it here with --any-processor"
@@ -87,10 +87,10 @@ def replay(subject: Subject, progress: ProgressCallback) -> list[Check]:
     return checks
 
 
-def _same_pretraining(subject: Subject) -> bool:
+def _same_pretraining(subject: Subject, progress: ProgressCallback) -> bool:
     """Return whether the run began with the policy that pretraining gives here."""
     announce("pretraining")
-    _, folder = pretrained_policy(subject.scenario, subject.spec.seed)
+    _, folder = pretrained_policy(subject.scenario, subject.spec.seed, progress)
     return pretrained_hash(folder) == subject.run.record.fingerprint.get("pretrained")
 
 

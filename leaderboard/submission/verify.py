@@ -27,12 +27,12 @@ from clbench.jobs.job import Job, JobError
 from clbench.jobs.processes import Processes
 from clbench.jobs.scheduler import run_with_bars
 from clbench.learning.optimise import MethodError
-from clbench.learning.pretraining import pretrain
+from clbench.learning.pretraining import is_pretrained, pretrain
 from clbench.policy.checkpoint import save_policy
 from clbench.records.fingerprints import LATER, other_parts, other_versions
 from clbench.records.reader import RecordError, UnreadableRecordError
 from clbench.records.record import Record, RunInfo, ScenarioInfo
-from clbench.runs.length import run_length, watching_length
+from clbench.runs.length import pretraining_length, run_length, watching_length
 from clbench.runs.run import execute, pretrained_hash
 from clbench.runs.spec import describe_scenario
 from clbench.scoring.metrics import measure
@@ -393,10 +393,11 @@ def _job(path: Path, records: Path, request: Request, report: Path) -> Job:
         if request.tier != "recomputed":
             device = subject.spec.device
             length += len(scenario.target) * scenario.budget.adaptation_steps
+            length += 0.0 if is_pretrained(scenario, subject.spec.seed) else pretraining_length(scenario)
         if request.tier == "retrained":
             length += run_length(scenario, subject.protocol)
             length += 0.0 if subject.strange else watching_length(subject.resolved.method, scenario)
-            length += scenario.budget.pretraining_steps * request.pretrain
+            length += pretraining_length(scenario) * request.pretrain
     except ClbenchError:
         pass  # the job itself reports the error
     arguments = {"path": path, "records": records, "request": request, "report": report}

@@ -12,18 +12,23 @@ from typing import Any
 import pytest
 import torch
 from eager import EAGER
+from rich.console import Console
 from safetensors.torch import load_file, save_file
 from verification import TOY, edit, failures, flip, verify
 
 from clbench.base.cache import MANIFEST, cached
 from clbench.base.progress import listen
 from clbench.evaluation.rollouts import Evaluator
+from clbench.jobs.job import Job
 from clbench.learning.method import Method
 from clbench.policy.policy import Policy
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
+from clbench.spec.registry import load_scenario
 
 tiers = importlib.import_module("clbench.leaderboard.board.tiers")
+subject = importlib.import_module("clbench.leaderboard.submission.subject")
+verifier = importlib.import_module("clbench.leaderboard.submission.verify")
 
 
 @pytest.fixture
@@ -321,3 +326,24 @@ def test_a_policy_that_is_off_by_a_tenth_of_its_way_is_refused(
         cached(place, inputs, write)
     checks = verify(mine, "replayed", tmp_path / "off", episodes=1, seed=0)
     assert {one.name: one.passed for one in checks}["from stage to stage"] is False
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("empty_caches")
+def test_the_bar_of_a_replay_counts_the_pretraining_that_the_replay_needs(
+    mine: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenario = load_scenario(TOY)
+    training = len(scenario.target) * scenario.budget.adaptation_steps
+
+    def run(jobs: list[Job], *_: object) -> dict[Job, str]:
+        done: list[float] = []
+        for job in jobs:
+            job.function(**job.arguments, progress=done.append)
+            assert sum(done) == job.length == scenario.budget.pretraining_steps + training + 1
+        return {}
+
+    monkeypatch.setattr(verifier, "run_with_bars", run)
+    request = subject.Request(tier="replayed", episodes=20, seed=0, scenario=TOY)
+    (outcome,) = verifier.run_verifications([mine], mine.parents[2], request, 1, Console())
+    assert [check["found"] for check in outcome.checks if check["passed"] is False] == []
