@@ -46,7 +46,7 @@ def compare(
         methods: One method or several: classes, installed names, or "module:Class". Classes from a notebook
             run one after the other, see `clbench.run`.
         seeds: Number of seeds.
-        first_seed: The first seed, below 100: no board shows the seeds for tuning.
+        first_seed: The first seed. All seeds must be below 100: no board shows the seeds for tuning.
         policy: Name of the policy, such as "discrete_diffusion", "flow-base" or "module:Class".
         records: Folder of the records. Records of other methods are not read.
         workers: Number of runs at once, each a process with one thread; all cores if None, or all
@@ -66,6 +66,11 @@ def compare(
         raise InputError(
             f"first_seed must be below {FIRST_TUNING_SEED}, not {first_seed}: the others are for tuning."
         )
+    if is_whole(first_seed) and is_whole(seeds) and first_seed + seeds > FIRST_TUNING_SEED:
+        raise InputError(
+            f"The last seed must be below {FIRST_TUNING_SEED}, not {first_seed + seeds - 1}: the others are "
+            "for tuning. Choose fewer seeds, or a smaller first_seed."
+        )
     several = [methods] if isinstance(methods, str | type) else methods
     names = dict.fromkeys([BASELINE, *map(name_of, several)])
     firsts = [RunSpec(scenario, name, first_seed, device=device, policy=policy) for name in names]
@@ -76,8 +81,11 @@ def compare(
         for number in range(seeds)
     }
     board = compute_board(Path(records), places)
-    absent = set(names) - {row.method for row in board.rows}
-    if absent:
+    counted_seeds = {row.method: len(row.seeds) for row in board.rows}
+    lacking = {name for name in names if counted_seeds.get(name, 0) < seeds}
+    if lacking:
+        absent = lacking - counted_seeds.keys()
+        what = "No row for" if absent else f"Fewer than {seeds} seeds for"
         reasons = " ".join(map(str, board.not_shown))
-        raise InputError(f"No row for {', '.join(sorted(absent))}. {reasons}")
+        raise InputError(f"{what} {', '.join(sorted(absent or lacking))}. {reasons}")
     return frame_of(board)

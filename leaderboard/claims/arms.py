@@ -78,9 +78,11 @@ def change_of_arms(verdict: Verdict, counting: Sequence[Figure], every: Sequence
     if verdict != "undecided":
         judged = best_first(list(every if verdict == "does not hold" else counting))
         return what_would_change(deciding(verdict, judged, bar), bar)
-    may_rise = (figure for figure in best_first(counting) if not figure.high < bar)
-    if (figure := next(may_rise, None)) is not None:
-        return what_would_change(figure, bar)
+    if may_rise := [figure for figure in best_first(counting) if not figure.high < bar]:
+        # all must fall below the bar, if not one rises above it: the one that needs the most seeds decides
+        falls = all(figure.value < bar for figure in may_rise)
+        slowest = max(may_rise, key=lambda one: (one.high - one.value) / (bar - one.value)) if falls else None
+        return what_would_change(slowest or may_rise[0], bar)
     above = next(figure for figure in every if not figure.high < bar)  # it keeps the claim from failing
     return (
         f'An interval of "{above.what}" that lies below {bar:{above.form}}: its arm does not count, but it '

@@ -169,10 +169,9 @@ def what_would_change(figure: Figure, bar: float) -> str:
     form = figure.form
     if apart >= 0:
         return f"The {interval} would have to move by {apart:{form}} to reach {bar:{form}}."
-    half, gap = (figure.high - figure.low) / 2, abs(figure.value - bar)
     if len(figure.seeds) < 2:
         return f"A narrower {interval}: it contains {bar:{form}}."
-    needed = _seeds_for(gap, half, len(figure.seeds))
+    needed = _seeds_for(figure, bar)
     how_many = f"about {needed}" if needed else f"more than {MOST_SEEDS}"
     return f"At this spread, {how_many} seeds would be needed: the {interval} contains {bar:{form}}."
 
@@ -200,21 +199,31 @@ def is_open(figure: Figure, bar: float) -> bool:
     return not (figure.low >= bar or figure.high < bar)
 
 
-def _seeds_for(reach: float, half: float, seeds: int) -> int | None:
-    """Return the number of seeds whose Student interval reaches no further than `reach`, None if too many.
+def _seeds_for(figure: Figure, bar: float) -> int | None:
+    """Return the number of seeds whose interval ends at the bar, None if too many.
 
     Args:
-        reach: Half the width that is wanted.
-        half: Half the width with `seeds` seeds.
-        seeds: Number of seeds now, at least 2.
+        figure: A figure of at least 2 seeds, whose interval contains the bar.
+        bar: Bar of the rule.
     """
-    error = half * math.sqrt(seeds) / student_quantile(seeds - 1)
+    seeds, nearer = len(figure.seeds), figure.low if bar < figure.value else figure.high
+    wanted = _reach(figure, bar) / _reach(figure, nearer) * student_quantile(seeds - 1) / math.sqrt(seeds)
     enough = (
         count
         for count in range(seeds, MOST_SEEDS + 1)
-        if error * student_quantile(count - 1) / math.sqrt(count) <= reach
+        if student_quantile(count - 1) / math.sqrt(count) <= wanted * (1 + 1e-9)
     )
     return next(enough, None)
+
+
+def _reach(figure: Figure, end: float) -> float:
+    """Return what the quantile times the error is proportional to if the interval has this end.
+
+    It is the distance; between two bounds, as in `interval_of_seeds`, the error is smaller near a bound.
+    """
+    low, high = figure.span
+    room = (end - low) * (high - end)
+    return abs(figure.value - end) / (math.sqrt(room) if 0 < room < math.inf else 1.0)
 
 
 def not_told_apart(control: Figure, name: str = "", *, explains: str, does_not: str) -> str:

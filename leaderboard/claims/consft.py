@@ -78,8 +78,14 @@ def sft_degrades(evidence: Evidence) -> Finding:
         (drop, at_one),
         (retention_drop(evidence, "frozen"), retention_drop(evidence, "joint"), joint, sparse),
         _what_joint_says(joint, learned),
-        what_would_change(drop, 0.05),
+        what_would_change(drop, 0.05) + (LOSES_AT_ONE if at_one.low > 0.05 >= drop.low else ""),
     )
+
+
+LOSES_AT_ONE = (
+    " Or a rule that asks for the scenario's learning rate: at that rate, sft certainly loses more than 0.05."
+)
+"""What C1 adds where the loss is certain, but not at the best learning rate."""
 
 
 def _what_joint_says(gain: Figure, learned: Figure) -> tuple[str, ...]:
@@ -211,7 +217,8 @@ def as_good_as_replay(evidence: Evidence) -> Finding:
     of_all, counting = _reaches(every.values(), every.values()), arms_that_count(evidence)
     arms = [every[arm] for arm in counting]
     if not arms:
-        return without_an_arm(evidence, [of_arm[0] for of_arm in every.values()], (), of_all)
+        others = [figure for of_arm in every.values() for figure in of_arm[1:]]
+        return without_an_arm(evidence, [of_arm[0] for of_arm in every.values()], others, of_all)
     verdict = _reaches(arms, every.values())
     holding = [arm[0].methods[0] for arm in arms if all(figure.low >= -0.05 for figure in arm)]
     others = [figure for arm in ARMS if arm not in counting for figure in every[arm]]

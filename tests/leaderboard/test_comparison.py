@@ -53,6 +53,24 @@ def test_a_method_whose_record_makes_no_row_is_named_with_the_reason(tmp_path: P
         clbench.compare(TINY.id, ["frozen"], seeds=1, records=tmp_path)
 
 
+@pytest.mark.long
+def test_a_seed_that_a_row_would_lack_is_named_with_the_reason(tmp_path: Path) -> None:
+    for method, seed in (("sft", 0), ("sft", 1), ("frozen", 0)):
+        execute(RunSpec(TINY.id, method, seed), tmp_path)
+    frozen = RunSpec(TINY.id, "frozen", seed=1)
+    record = execute(frozen, tmp_path)
+    record.fingerprint["rollouts"] = dict.fromkeys(record.fingerprint["rollouts"], "0" * 16)
+    write_record(record, frozen.path(tmp_path))
+    with pytest.raises(InputError, match=r"Fewer than 2 seeds for frozen\. .*frozen/seed-1\.json: "):
+        clbench.compare(TINY.id, ["frozen"], seeds=2, records=tmp_path)
+
+
+def test_seeds_for_tuning_are_refused_before_anything_runs(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="The last seed must be below 100, not 101: the others are for tun"):
+        clbench.compare(TOY, "frozen", seeds=4, first_seed=98, records=tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
 def test_an_unknown_method_is_named_before_anything_runs(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="first_seed must be below 100, not 100: the others are for tuning"):
         clbench.compare(TOY, "frozen", first_seed=100, records=tmp_path)

@@ -54,6 +54,14 @@ def test_the_kind_of_replay_that_decides_is_named_whatever_is_known_of_the_other
     assert fails == (verdict == "does not hold")
 
 
+def test_without_an_arm_that_counts_both_kinds_of_replay_are_shown() -> None:
+    fewer = (-0.3, -0.2)
+    given = {**kept(fewer, fewer, "experience_replay"), **kept(fewer, fewer, "buffered_replay")}
+    finding = judged("C3", {**NONE_COUNTS, **given})
+    assert finding.verdict == "cannot be shown here"
+    assert given.keys() <= {figure.what for figure in (*finding.figures, *finding.controls)}
+
+
 def test_an_arm_that_does_not_count_and_keeps_a_claim_from_failing_is_named_as_such() -> None:
     given = {**shares(0.05, 0.2), **kept((0.25, 0.35), (0.0, 0.1)), **kept((0.0, 0.1), (0.0, 0.1), rung="@1")}
     finding = judged("C2", given)
@@ -62,6 +70,13 @@ def test_an_arm_that_does_not_count_and_keeps_a_claim_from_failing_is_named_as_s
         'An interval of "retained success, consft - sft" that lies below 0.20: its arm does not count, but '
         "it keeps the claim from failing."
     )
+
+
+def test_where_every_gain_must_fall_below_the_bar_the_widest_interval_decides() -> None:
+    given = {**kept((-0.2, 0.26), (-0.05, 0.199)), **kept((-0.29, 0.32), (-0.27, 0.33), rung="@1")}
+    finding = judged("C2", {**BOTH_COUNT, **given})
+    assert finding.verdict == "undecided"
+    assert '"retained success, consft_calibrated@1 - sft@1" contains 0.20' in finding.change
 
 
 @pytest.mark.parametrize("ladder", [True, False])

@@ -229,6 +229,17 @@ def test_the_seeds_that_would_decide_are_those_whose_interval_ends_at_the_bar(di
     assert f"At this spread, {needed} seeds would be needed: " in what_would_change(figure, 0.05)
 
 
+def test_the_seeds_that_would_decide_a_share_near_0_are_those_of_its_own_interval() -> None:
+    error = 0.00766  # of 12 seeds; the interval reaches far above the value, and not far below it
+    ends = interval_of_seeds(0.0151, error, 11, (0.0, 1.0))
+    figure = Figure("a share", (), Estimate(0.0151, *ends), tuple(range(12)), span=(0.0, 1.0))
+    lows = {
+        n: interval_of_seeds(0.0151, error * (12 / n) ** 0.5, n - 1, (0.0, 1.0))[0] for n in range(12, 101)
+    }
+    needed = next(n for n, low in lows.items() if low >= 0.01)
+    assert f"At this spread, about {needed} seeds would be needed: " in what_would_change(figure, 0.01)
+
+
 def test_a_run_in_another_order_of_the_targets_is_no_evidence(bench: Bench, add: Callable[..., None]) -> None:
     for seed in range(2):
         add("sft", seed, [[1, 1, 0, 0, 0], [1, 1, 1, 0, 0], [0.5, 0.5, 1, 1, 0]])

@@ -292,6 +292,15 @@ def test_skills_that_joint_training_loses_too_are_not_put_down_to_the_missing_co
     assert sentence.startswith(says)
 
 
+@pytest.mark.parametrize(("best", "said"), [((-0.02, 0.4), True), ((0.051, 0.4), False)])
+def test_a_loss_that_only_the_best_learning_rate_leaves_open_is_told(
+    best: tuple[float, float], said: bool
+) -> None:
+    drop = "retained success, pretrained - {} after the last target"
+    finding = judged("C1", {drop.format("sft"): best, drop.format("sft@1"): (0.3, 0.8)})
+    assert finding.change.endswith("at that rate, sft certainly loses more than 0.05.") is said
+
+
 def test_an_arm_that_does_not_count_is_shown_with_the_verdict_that_it_would_give(bench: Bench) -> None:
     bench.add("sft", earlier=0.4)
     bench.add("consft", earlier=1.0, diagnostics=SAME)
