@@ -8,10 +8,7 @@ Schema 2 wrote "report" for the split "test" and "selection" for "validation", n
 after these words, and left out `order`, `perturb` and costs where they had their usual values. Its stages had
 no criterion, the shift of the policy was not measured, and nothing was relearned.
 
-Schema 1 knew no tuning runs, evaluated only the target before the end of a stage, on all test episodes and at
-equal intervals, asked questions only at the ends of stages, and did not measure changes of the policy. All of
-this follows from its budget, so its records are converted without guessing. Metrics of quantities that it did
-not measure are missing.
+No published record has schema 1, so no reader knows it.
 """
 
 from __future__ import annotations
@@ -20,10 +17,13 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from clbench.base.errors import InputError
-from clbench.records.record import CheckRow
+from clbench.records.record import CheckRow, Costs
+
+OLDEST = 2
+"""Oldest schema that can be read."""
 
 SPLITS = {"report": "test", "selection": "validation"}
-"""Splits of schemas 1 and 2, with their present names."""
+"""Splits of schema 2, with their present names."""
 
 BUDGET = {
     "perturbation": "noisy_demonstrations",
@@ -31,20 +31,7 @@ BUDGET = {
     "selection_episodes": "validation_episodes",
     "report_episodes": "test_episodes",
 }
-"""Fields of the budget of schemas 1 and 2 that have another name now, with that name."""
-
-COSTS = (
-    "optimiser_steps",
-    "parameters",
-    "preparation_steps",
-    "parameters_added",
-    "bytes_kept",
-    "environment_steps",
-)
-"""All costs. Schemas 1 and 2 left out those that were not known."""
-
-POLICY = ("stage", "step", "update_sparsity", "activation_drift")
-"""Columns of the table of changes of the policy in schema 2."""
+"""Fields of the budget of schema 2 that have another name now, with that name."""
 
 MOVED = {
     "clbench.envs.fetch.pixel_world:FetchPixelsWorld": "clbench.envs.fetch_pixels.world:FetchPixelsWorld",
@@ -68,47 +55,9 @@ def to_present(values: Mapping[str, Any], schema: int) -> _Values:
         InputError: A field is of a later schema, or holds what its own does not allow.
     """
     converted = dict(values)
-    for step in _STEPS[schema - 1 :]:
+    for step in _STEPS[schema - OLDEST :]:
         converted = step(converted)
     return converted
-
-
-def _from_1(values: _Values) -> _Values:
-    """Convert schema 1 to schema 2."""
-    _refuse_later("a record", values, ("policy",), 1)
-    run, scenario, answers, diagnostics = (
-        _part(values, name) for name in ("run", "scenario", "answers", "diagnostics")
-    )
-    if run is not None:
-        _refuse_later("run", run, ("split", "order", "perturb"), 1)
-        run["split"] = "report"
-    end = None
-    if scenario is not None:
-        _refuse_later("scenario", scenario, ("evaluation_steps",), 1)
-        budget = _part(scenario, "budget")
-        if budget is not None:
-            _refuse_later("budget", budget, ("curve_episodes",), 1)
-            steps = _equal_steps(budget.get("adaptation_steps"), budget.get("evaluation_points"))
-            end, scenario["evaluation_steps"] = steps[-1], steps
-            scenario["budget"] = {**budget, "curve_episodes": budget.get("report_episodes")}
-    if answers is not None and isinstance(answers.get("stage"), list):
-        _refuse_later("answers", answers, ("step",), 1)
-        stages = answers.pop("stage")
-        answers = {"stage": stages, "step": [end if stage else 0 for stage in stages], **answers}
-    if diagnostics and scenario is not None and isinstance(scenario.get("target"), list):
-        diagnostics = {str(len(scenario["target"])): diagnostics}  # reported once, at the end
-    changed = {"run": run, "scenario": scenario, "answers": answers, "diagnostics": diagnostics}
-    return {**_with(values, changed), "policy": {name: [] for name in POLICY}}
-
-
-def _equal_steps(last: Any, points: Any) -> list[int]:
-    """Return the evaluation steps of schema 1, at equal intervals up to the last one."""
-    if type(last) is not int or type(points) is not int or not 1 <= points <= 100 or last < 1:
-        raise InputError(
-            "scenario: adaptation_steps and evaluation_points of its budget must be whole numbers."
-        )
-    points = min(points, last)
-    return [round((point + 1) * last / points) for point in range(points)]
 
 
 def _from_2(values: _Values) -> _Values:
@@ -135,7 +84,7 @@ def _from_2(values: _Values) -> _Values:
     if episodes is not None and isinstance(episodes.get("split"), list):
         episodes["split"] = [_split(split, "episodes: split") for split in episodes["split"]]
     if costs is not None:
-        costs = {**dict.fromkeys(COSTS), **costs}
+        costs = {**vars(Costs()), **costs}
     if policy is not None and isinstance(policy.get("stage"), list):
         _refuse_later("policy", policy, ("shift",), 2)
         policy["shift"] = [None] * len(policy["stage"])
@@ -166,8 +115,8 @@ def _from_4(values: _Values) -> _Values:
     return _with(values, {"run": run, "fingerprint": fingerprint})
 
 
-_STEPS: tuple[Callable[[_Values], _Values], ...] = (_from_1, _from_2, _from_3, _from_4)
-"""Functions that convert each schema, from 1, to the next one."""
+_STEPS: tuple[Callable[[_Values], _Values], ...] = (_from_2, _from_3, _from_4)
+"""Functions that convert each schema, from the oldest, to the next one."""
 
 
 def _part(values: _Values, name: str) -> _Values | None:

@@ -12,7 +12,7 @@ from clbench.base.strict_json import StrictJSONError, read_json, refusal
 from clbench.base.text import quoted
 from clbench.records.content import content_hash
 from clbench.records.fields import load_fields
-from clbench.records.history import to_present
+from clbench.records.history import OLDEST, to_present
 from clbench.records.paths import label_of, record_name
 from clbench.records.record import (
     EPISODE_COLUMNS,
@@ -105,13 +105,13 @@ def check_home(run: RunInfo, path: Path, records: Path | None = None) -> Path:
 def _record(values: Any) -> Record:
     """Return the record in `values`, which `json` read from its file."""
     schema = values.get("schema") if isinstance(values, dict) else None
-    if type(schema) is not int or schema < 1:
+    if type(schema) is not int or schema < OLDEST:
         found = (
             "no object" if not isinstance(values, dict) else "none" if schema is None else quoted(str(schema))
         )
         raise RecordError(
-            f"is not a record of clbench: expected an object whose `schema` is a whole number from 1 to "
-            f"{SCHEMA}, found {found}."
+            f"is not a record of clbench: expected an object whose `schema` is a whole number from "
+            f"{OLDEST} to {SCHEMA}, found {found}."
         )
     if schema > SCHEMA:
         raise UnreadableRecordError(f"has schema {schema}, which is newer than {SCHEMA}: update clbench.")

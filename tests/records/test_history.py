@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from clbench.base.errors import InputError
+from clbench.records.history import OLDEST
 from clbench.records.reader import RecordError, read_record
 from clbench.records.record import SCHEMA, Costs
 from clbench.records.writer import write_record
@@ -16,12 +17,6 @@ from clbench.scoring.scores import Scores
 HISTORIC = Path(__file__).parent / "historic"
 
 VALUES: dict[str, dict[str, float | None]] = {
-    "schema-1/Fetch-v0-sft-seed-0.json": {
-        "final_average": 0.1,
-        "adaptation": 0.9875,
-        "question_retention": 0.928,
-        "update_sparsity": None,
-    },
     "schema-2/DMControl-v0-sac-online.json": {
         "final_average": 0.15,
         "retention": 0.22,
@@ -54,7 +49,9 @@ VALUES: dict[str, dict[str, float | None]] = {
 
 
 def test_every_older_schema_has_a_historic_record() -> None:
-    assert {path.name for path in HISTORIC.iterdir()} == {f"schema-{number}" for number in range(1, SCHEMA)}
+    assert {path.name for path in HISTORIC.iterdir()} == {
+        f"schema-{number}" for number in range(OLDEST, SCHEMA)
+    }
     assert {path.relative_to(HISTORIC).as_posix() for path in HISTORIC.rglob("*.json")} == set(VALUES)
 
 
@@ -106,29 +103,11 @@ def test_quantities_that_schema_2_did_not_measure_are_missing() -> None:
     assert tuning.relearning is None
 
 
-def test_fields_that_follow_from_the_budget_of_schema_1_are_filled_in() -> None:
-    record = read_record(HISTORIC / "schema-1" / "Fetch-v0-sft-seed-0.json")
-    assert record.run.split == "test"
-    assert record.scenario.evaluation_steps == [75, 150, 225, 300]
-    assert record.scenario.budget["curve_episodes"] == record.scenario.budget["test_episodes"] == 20
-    assert set(zip(record.answers["stage"], record.answers["step"], strict=True)) == {
-        (0, 0),
-        *((stage, 300) for stage in range(1, 5)),
-    }
-    assert not record.policy["stage"]
-
-
-def test_evaluation_steps_of_schema_1_are_rounded_to_the_nearest_step(tmp_path: Path) -> None:
-    values = json.loads((HISTORIC / "schema-1" / "Fetch-v0-sft-seed-0.json").read_text(encoding="utf-8"))
-    values["scenario"]["budget"] |= {"adaptation_steps": 11, "evaluation_points": 4}
-    (tmp_path / "record.json").write_text(json.dumps(values), encoding="utf-8")
-    assert read_record(tmp_path / "record.json").scenario.evaluation_steps == [3, 6, 8, 11]
-
-
-OLD = {1: HISTORIC / "schema-1" / "Fetch-v0-sft-seed-0.json"}
-OLD[4] = HISTORIC / "schema-4" / "Fetch-v1-sft-seed-0.json"
-OLD[3] = HISTORIC / "schema-3" / "Fetch-v1-sft-tuning.json"
-OLD[2] = HISTORIC / "schema-2" / "DMControl-v0-sac-online.json"
+OLD = {
+    2: HISTORIC / "schema-2" / "DMControl-v0-sac-online.json",
+    3: HISTORIC / "schema-3" / "Fetch-v1-sft-tuning.json",
+    4: HISTORIC / "schema-4" / "Fetch-v1-sft-seed-0.json",
+}
 
 
 def put(values: dict[str, Any], place: str, value: Any) -> None:
@@ -158,13 +137,8 @@ def put(values: dict[str, Any], place: str, value: Any) -> None:
         (2, "content", "0123", "a record of schema 2 has no content"),
         (2, "scenario", [], "scenario must be an object"),
         (2, "episodes", None, "episodes must be an object"),
-        (1, "policy", {}, "a record: schema 1 has no policy"),
-        (1, "run.split", "report", "run: schema 1 has no split"),
-        (1, "scenario.evaluation_steps", [300], "scenario: schema 1 has no evaluation_steps"),
-        (1, "scenario.budget.evaluation_points", 0, "evaluation_points of its budget must be whole numbers"),
-        (1, "scenario.budget", None, "scenario: evaluation_steps is missing"),
-        (1, "answers.step", [], "answers: schema 1 has no step"),
-        (1, "run", 5, "run must be an object"),
+        (2, "run", 5, "run must be an object"),
+        (2, "scenario.budget", None, "scenario: budget must be an object"),
     ],
 )
 def test_a_record_that_breaks_its_old_schema_is_refused_with_the_fault(

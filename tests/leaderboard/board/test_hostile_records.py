@@ -119,10 +119,10 @@ NAMES = [
 ]
 
 FIELDS = [
-    ("schema", 1, "a record: schema 1 has no policy"),
+    ("schema", 1, "a whole number from 2 to 5"),
     ("schema", 2, "run: order must be above 0 in schema 2"),
     ("schema", 6, "has schema 6, which is newer than 5: update clbench"),
-    ("schema", "3", "a whole number from 1 to 5"),
+    ("schema", "3", "a whole number from 2 to 5"),
     ("score", 0.99, "No field of a record of schema 5 is called 'score'"),
     ("costs", ABSENT, "a record of schema 5: costs is missing"),
     ("costs.bytes_kept", -1, "costs: bytes_kept must not be below 0"),

@@ -45,10 +45,10 @@ def test_a_record_that_is_not_of_its_schema_is_listed_and_hides_no_other(
 ) -> None:
     before = load(four_methods)
     path = add_full("old", 0)
-    path.write_text(path.read_text(encoding="utf-8").replace('"schema": 5', '"schema": 1'), encoding="utf-8")
+    path.write_text(path.read_text(encoding="utf-8").replace('"schema": 5', '"schema": 2'), encoding="utf-8")
     pandas.testing.assert_frame_equal(load(four_methods), before)
     for text in shown():
-        assert "old/seed-0.json: a record: schema 1 has no policy" in flat(text)
+        assert "old/seed-0.json: run: order must be above 0 in schema 2" in flat(text)
 
 
 def fail(record: Record) -> None:
