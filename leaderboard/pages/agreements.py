@@ -27,7 +27,13 @@ from ..views.sections import Section, Table, short
 
 # ---- orders ------------------------------------------------------------------------------------------------
 
+COUNTED = (
+    "Here, plain fine-tuning counts as a method, but controls do not: each is another method with one thing "
+    "changed."
+)
+
 W_NOTE = (
+    f"{COUNTED} "
     "Kendall's W is 1 if all seeds order the methods alike, and 0 if they do not agree at all; its p-value "
     "comes from Friedman's test. Shares of the variance are those of the final average, as omega squared, "
     "for methods without prior demonstrations; each seed has its own order of the targets."
@@ -125,7 +131,8 @@ def _of_definitions(boards: Mapping[str, list[Row]]) -> tuple[list[str], Table, 
 # ---- predictors --------------------------------------------------------------------------------------------
 
 PREDICTED = (
-    "Here, forgetting is 1 minus the kept share. Both quantities come from the same runs, so p is simulated: "
+    f"{COUNTED} "
+    "Forgetting here is 1 minus the kept share. Both quantities come from the same runs, so p is simulated: "
     "it is the share of simulated boards with equal methods, and with the noise of these runs, that have "
     "such a tau. Methods differ in more than one way, for example in learning rate, so an order that agrees "
     "does not show what causes forgetting."

@@ -176,7 +176,8 @@ def _largest_losses(losses: Sequence[_Losses]) -> list[str]:
         found = [(name, lost) for is_kind, name, lost in losses if is_kind == kind]
         halves: list[str] = []
         for place, what in enumerate(("success on the skills", "the share of correct answers")):
-            known = [(loss, name) for name, lost in found if (loss := lost[place]) is not None]
+            # a rise is no fall
+            known = [(max(loss, 0.0), name) for name, lost in found if (loss := lost[place]) is not None]
             if known:
                 loss, name = max(known, key=itemgetter(0))
                 halves.append(f"{what}{'' if halves else ' falls'} by up to {loss:.2f} ({name})")

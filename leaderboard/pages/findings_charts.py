@@ -44,16 +44,15 @@ def _panel(name: str, rows: Sequence[Row]) -> Spec:
         for row in rows
     ]
     divisions = [division for division in DIVISIONS if any(row.division == division for row in rows)]
+    places = [DIVISIONS.index(division) for division in divisions]
     method = _names(row.method for row in rows)
     hue = {
         "field": "division",
         "type": "nominal",
         "legend": {"columnPadding": 28},
-        "scale": {
-            "domain": divisions,
-            "range": [colour(f"mark-{DIVISIONS.index(division)}") for division in divisions],
-        },
+        "scale": {"domain": divisions, "range": [colour(f"mark-{place}") for place in places]},
     }
+    shape = hue | {"scale": {"domain": divisions, "range": [SHAPES[place] for place in places]}}
     gain = axis(
         "value", "gain over plain fine-tuning, with 95 % interval", axis={"format": ".2~f", "tickCount": 6}
     )
@@ -70,7 +69,7 @@ def _panel(name: str, rows: Sequence[Row]) -> Spec:
             {"mark": {"type": "rule", "strokeWidth": 2}, "encoding": {"y": method, "color": hue, **ends}},
             {
                 "mark": {"type": "point", "filled": True, "size": 70, "opacity": 1},
-                "encoding": {"y": method, "x": gain, "color": hue},
+                "encoding": {"y": method, "x": gain, "color": hue, "shape": shape},
             },
         ],
     }

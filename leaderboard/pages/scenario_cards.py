@@ -324,4 +324,5 @@ def _before_its_stage(rates: Rates) -> Array:
 
 def _checks(rates: Rates) -> Array:
     planned = check_steps(rates.layout.steps[-1])
-    return average(np.searchsorted(planned, rates.steps, side="right").astype(float))
+    checks = np.searchsorted(planned, rates.steps, side="right")
+    return average(np.where(np.isnan(rates.steps), np.nan, checks))  # NaN would count as all checks

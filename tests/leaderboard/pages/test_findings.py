@@ -407,6 +407,30 @@ def test_without_retained_skills_no_loss_of_skills_is_told(
     assert section.strip() == said
 
 
+def test_colour_is_not_the_only_sign_of_a_division_in_the_picture_of_the_gains(
+    even_board: Callable[..., Path], page: Callable[[], str], tmp_path: Path
+) -> None:
+    for method in ("sft", "finch", "experience_replay"):
+        records = even_board(method, 0, 0.4)
+    keep_demonstrations(records)
+    page()
+    svg = (tmp_path / "docs/findings/gains.svg").read_text(encoding="utf-8")
+    marks = re.findall(r'aria-roledescription="point"[^>]* d="(.*?)"', svg)
+    assert len(marks) == len(set(marks)) == 2
+
+
+def test_what_rises_falls_by_nothing(
+    make_record: Callable[..., Record], tmp_path: Path, page: Callable[[], str]
+) -> None:
+    for method, more in (("sft", 1), ("frozen", 0)):
+        answers = {(stage, "left"): (50, 45 + stage * more) for stage in range(2)}
+        success = [[0.5, 0, 0, 0], [0.5 + more / 2, 0, 0, 0]]
+        record = make_record(success, method=method, groups=(1, 1, 2), answers=answers)
+        write_record(record, record_path(tmp_path / "records", "clbench/Toy-v0", method, 0))
+    section = page().partition("## Are skills and knowledge lost together?")[2]
+    assert "falls by up to 0.00 (Toy-v0), and the share of correct answers by up to 0.00 (Toy-v0)" in section
+
+
 def test_a_single_seed_has_no_interval_in_any_section_and_picture(
     even_board: Callable[..., Path], page: Callable[[], str]
 ) -> None:

@@ -385,6 +385,22 @@ def test_a_wrong_word_is_named(
     assert not bench.output.exists()
 
 
+def test_one_seed_has_intervals_over_episodes_and_none_of_its_checks(
+    make_record: Callable[..., Record], tmp_path: Path
+) -> None:
+    budget = dataclasses.replace(TOY.budget, adaptation_steps=20, criterion=0.9)
+    scenario = dataclasses.replace(TOY, id="clbench/Even-v1", budget=budget)
+    success = [[1, 1, 0.1, 0, 0], [0.5, 0.5, 0.9, 0.3, 0], [0.5, 0.5, 0.5, 0.9, 0]]
+    record = make_record(success, steps=(20,), ends=(8, 20), method="sft", scenario=scenario.id)
+    write_record(record, tmp_path / "Even-v1" / "sft" / "seed-0.json")
+    board = resolve("clbench.leaderboard.board.rows:compute_board")(tmp_path)
+    experts = resolve("clbench.leaderboard.pages.scenario_tasks:Experts")(3, dict.fromkeys(NAMES, 3))
+    card = resolve("clbench.leaderboard.pages.scenario_cards:Card")(scenario, board, experts, frozenset())
+    page = card.page().replace("\\", "")
+    assert "95 % confidence intervals over seeds (over episodes if there is only one seed)." in page
+    assert bars(page)["checks of sft until a target is learned"][1] == "8.00"
+
+
 @pytest.mark.long
 def test_a_scenario_with_a_criterion_has_bars_and_orders_of_its_own(
     make_record: Callable[..., Record], tmp_path: Path
