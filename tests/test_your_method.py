@@ -57,10 +57,8 @@ def recipe(name: str) -> Any:
 class Visits(Method):
     """Keeps the states that its policy visits."""
 
-    scenario: str = "clbench.testing:clbench/Toy-v0"
-
     def end_task(self, policy: Policy, stage: Stage) -> None:
-        self.seen = torch.tensor(np.stack(sys.modules["recipes"].visited(policy, self.scenario, stage)))
+        self.seen = torch.tensor(np.stack(sys.modules["recipes"].visited(policy, stage)))
 
     def diagnostics(self) -> dict[str, Any]:
         return {"seen": self.seen.tolist()} if hasattr(self, "seen") else {}
