@@ -172,7 +172,7 @@ def agreement_text(found: Concordance | None) -> str:
     """Return a sentence on how alike the seeds order the methods; empty if it is not known."""
     if found is None:
         return ""
-    alike = f"the {found.seeds} seeds agree on the order of the {found.rows} methods"
+    alike = f"the {found.seeds} seeds agree on the order of the {found.rows} methods (without controls)"
     if found.certain:
         return f"{alike[0].upper()}{alike[1:]} more than chance would explain: {concordance_text(found)}."
     return f"It is not certain that {alike}: {concordance_text(found)}."

@@ -18,7 +18,7 @@ from clbench.scoring.metric import TIE
 from clbench.scoring.metrics import METRICS
 
 from ..board.overall import OverallRow, overall
-from ..board.summary import RowSummary, Summary, divisions_of, tables_of
+from ..board.summary import RowSummary, Summary, divisions_of, letters_of, tables_of
 from ..board.tiers import TIERS
 from .format import (
     MISSING,
@@ -183,7 +183,7 @@ def _best(head: _Head, rows: Sequence[Any]) -> float | None:
 
 
 def _letters(row: RowSummary | OverallRow, rows: Sequence[Any]) -> str:
-    return aligned(row.letters, rows) if isinstance(row, RowSummary) else ""
+    return aligned(letters_of(row, rows), rows) if isinstance(row, RowSummary) else ""
 
 
 def _heads(rows: list[RowSummary], sort: str | None) -> list[_Head]:

@@ -46,7 +46,7 @@ def test_each_back_end_is_tried_on_all_worlds_even_if_they_come_from_a_generator
     tried = _only(monkeypatch)
     with pytest.raises(RenderingError):
         choose_back_end(world for world in (WORLD, "clbench.testing:Other"))
-    assert tried == ["egl", "egl", "osmesa", "osmesa"]
+    assert tried == ["egl", "egl", "osmesa", "osmesa", "egl", "osmesa"]  # at last, without a world
 
 
 class Blind(ToyWorld):
@@ -75,6 +75,16 @@ def test_where_nothing_draws_the_debian_packages_are_named(monkeypatch: pytest.M
     assert os.environ["MUJOCO_GL"] == ""
 
 
+def test_a_world_that_fails_where_a_back_end_works_is_to_blame(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fault(back_end: str, world: str | None = None) -> str | None:
+        return "NotImplementedError" if world or back_end == "egl" else None
+
+    monkeypatch.setattr("clbench.worlds.gl_backend.rendering_fault", fault)
+    with pytest.raises(RenderingError) as raised:
+        choose_back_end([WORLD])
+    assert str(raised.value) == f"osmesa works on this machine, but cannot draw {WORLD}: NotImplementedError"
+
+
 def test_the_choice_of_the_user_is_obeyed(monkeypatch: pytest.MonkeyPatch) -> None:
     tried = _only(monkeypatch, "egl", "osmesa", "glfw")
     monkeypatch.setenv("MUJOCO_GL", "glfw")
@@ -84,7 +94,7 @@ def test_the_choice_of_the_user_is_obeyed(monkeypatch: pytest.MonkeyPatch) -> No
         RenderingError, match="MUJOCO_GL is set to cgl: unset it, and clbench chooses what works"
     ):
         choose_back_end([WORLD])
-    assert tried == ["glfw", "cgl"]
+    assert tried == ["glfw", "cgl", "cgl"]
 
 
 def test_the_fault_is_the_last_line_of_the_process_that_tried() -> None:

@@ -85,7 +85,7 @@ def _disagreements(metrics: Iterable[Metric], rows: Sequence[Row]) -> tuple[froz
         if len(opposed) > worst:
             worst, clear, names = len(opposed), len(apart), (first.name, second.name)
     if not worst:
-        return frozenset(), "All definitions put the methods in the same order."
+        return frozenset(), "No two definitions put two methods in opposite orders."
     return frozenset(depends), (
         f"“{title_of(names[0])}” and “{title_of(names[1])}” disagree most. They put {worst} of {len(pairs)} "
         f"pairs of methods in opposite orders; for {clear} of these, the intervals do not overlap under "

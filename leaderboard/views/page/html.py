@@ -15,12 +15,12 @@ import vl_convert
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from clbench.base.text import counted
+from clbench.base.text import counted, printable
 from clbench.records.paths import table_parts
 from clbench.spec.identifiers import built_in_methods, folder_name
 
 from ...board.rows import Board
-from ...board.summary import DIVISIONS
+from ...board.summary import DIVISIONS, ELSEWHERE
 from ...board.tiers import TIERS
 from ...policies.compared import Comparisons
 from ..charts.along import SERIES, along_a_run
@@ -112,7 +112,7 @@ def pictures(board: Board) -> dict[str, str]:
     They are the plane of the scenario with the most methods, and the frontier of each scenario that has one.
     """
     rows = max(sorted_tables(board).values(), key=len, default=[])
-    specs = {"pareto": plane(rows, WIDE)}
+    specs = {"pareto": plane(rows, WIDE, rows[0].scenario if rows else "")}
     for scenario, curves in board.frontiers.items():
         specs[f"frontier-{folder_name(scenario)}"] = frontier(curves, WIDE_FRONTIER, FONT)
     return {name: svg for stem, spec in specs.items() for name, svg in in_both_themes(stem, spec).items()}
@@ -247,6 +247,13 @@ def _scenario_data(one: ScenarioView) -> dict[str, Any]:
     titles = names if one.balanced else [f"{number} {name}" for number, name in enumerate(names, 1)]
     steps = (1,) if one.to_criterion else one.steps
     length = None if one.to_criterion else one.steps[-1]
+    if one.balanced:
+        extra["orders"] = {
+            str(run.seed): [printable(name) for name in run.scores.layout.target]
+            for view in one.rows
+            if view.row.division not in ELSEWHERE  # those keep the published order
+            for run in view.row.runs
+        }
     if one.has_agents:
         extra["run_elsewhere"] = along_a_run(titles, length, by_agent=True)
     return {

@@ -409,6 +409,8 @@
       cell.firstChild.data = text(value);
       cell.className = cell.className.replace(/^\S+/, value === null ? "none" : `s${Math.round(value * data.shades)}`);
     }));
+    const order = data.scenarios[data.rows[opened].scenario].orders?.[chosen.dataset.seed];
+    dialog.querySelector(".order").textContent = order ? ` Targets 1 to ${order.length} of this seed: ${order.join(", ")}.` : "";
     for (const other of chosen.parentElement.children) other.ariaPressed = String(other === chosen);
   });
 

@@ -69,6 +69,8 @@ def headline(rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]] | None 
     members = competing(rows)
     baseline = next((row for row in members if row.method == BASELINE), None)
     others = [row for row in members if row.method != BASELINE]
+    if not members:
+        return "No method that competes has run here."
     if baseline is None:
         return f"{counted(len(members), 'method')}, not yet compared with plain fine-tuning."
     if not others:

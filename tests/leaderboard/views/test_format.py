@@ -79,11 +79,12 @@ def test_a_tier_is_the_lowest_of_the_runs_and_names_those_above_it(rows: dict[st
 def test_only_an_agreement_beyond_chance_is_called_one() -> None:
     sure = Concordance(0.55, 0.0004, seeds=12, rows=15)
     assert agreement_text(sure) == (
-        "The 12 seeds agree on the order of the 15 methods more than chance would explain: Kendall's W 0.55, "
-        "p < 0.001."
+        "The 12 seeds agree on the order of the 15 methods (without controls) more than chance would "
+        "explain: Kendall's W 0.55, p < 0.001."
     )
     assert agreement_text(dataclasses.replace(sure, w=0.1, chance=0.2)) == (
-        "It is not certain that the 12 seeds agree on the order of the 15 methods: Kendall's W 0.10, p = 0.2."
+        "It is not certain that the 12 seeds agree on the order of the 15 methods (without controls): "
+        "Kendall's W 0.10, p = 0.2."
     )
     assert agreement_text(None) == ""
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, Locator, Page
+from playwright.sync_api import Browser, Locator, Page, expect
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 SITE = Path(__file__).parents[4] / "leaderboard" / "site"
@@ -82,3 +82,33 @@ def test_every_tab_fits_the_screen_and_axe_finds_nothing_serious(opened: Page) -
         assert not [one["id"] for one in found if one["impact"] in ("serious", "critical")]
         # axe would look at all parts that were opened, again and again
         opened.evaluate("document.querySelector('.part:not([hidden])').remove()")
+
+
+def test_a_seed_names_its_targets_in_their_order(opened: Page) -> None:
+    record = json.loads((SITE.parent / "records" / "Fetch-v1" / "sft" / "seed-1.json").read_text())
+    order = f"Targets 1 to 4 of this seed: {', '.join(record['scenario']['target'])}."
+    opened.goto(f"{(SITE / 'index.html').as_uri()}#{MAIN}/sft")
+    row = opened.locator("dialog[open]")
+    row.get_by_role("button", name="seed 1", exact=True).click()
+    expect(row).to_contain_text(order)
+    row.get_by_role("button", name="mean").click()
+    expect(row).not_to_contain_text("Targets 1 to 4 of this seed")
+
+
+def test_forced_colours_show_the_open_tab_the_chosen_seed_and_the_frames(opened: Page) -> None:
+    def style(chosen: str, name: str) -> str:
+        found: str = opened.evaluate(
+            "([chosen, name]) => getComputedStyle(document.querySelector(chosen))[name]", [chosen, name]
+        )
+        return found
+
+    opened.emulate_media(forced_colors="active")
+    current, other = (
+        style(f".tabs a{kind}", "borderBottomColor") for kind in ("[aria-current]", ":not([aria-current])")
+    )
+    assert current != other
+    opened.goto(f"{(SITE / 'index.html').as_uri()}#{MAIN}/sft")
+    opened.locator("dialog[open] .matrix").wait_for()
+    pressed, free = (style(f".seeds [aria-pressed={kind}]", "backgroundColor") for kind in ("true", "false"))
+    assert pressed != free
+    assert style(".matrix .learned", "outlineStyle") == "solid"

@@ -55,6 +55,10 @@ def test_a_method_that_ends_higher_is_named_with_its_gain(board: Callable[..., A
     )
 
 
+def test_a_board_of_references_alone_has_nothing_to_compare(board: Callable[..., Any]) -> None:
+    assert headline(board(frozen=matrix(0.2))) == "No method that competes has run here."
+
+
 def test_several_methods_that_end_higher_share_a_sentence(board: Callable[..., Any]) -> None:
     rows = board(sft=matrix(0.2), replay=matrix(0.9), lora=matrix(0.6))
     lora, replay = (
