@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -209,13 +210,11 @@ def score(
         if is_scored(scenario, **options):
             print_plain(console, f"Stage {stage} of {method}, seed {seed}, is done.")
             return
-        served = ServedPolicy(policy, timeout)
-        with Bars(1.0, console) as bars:
+        with closing(ServedPolicy(policy, timeout)) as served, Bars(1.0, console) as bars:
             bars.start(piece, 1.0)
             record = evaluate(scenario, served, **options, progress=lambda share: bars.advance(piece, share))
             server = record.diagnostics[str(stage)].get("server")
             bars.finish(piece, _rates(record) + (f" (server: {described(server)})" if server else ""))
-        served.close()
     targets, path = record.scenario.target, record_path(records, record.run.scenario, method, seed)
     if stage < len(targets):
         then = (

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clbench.base.entry_points import unknown
+from clbench.base.errors import UnknownNameError
 from clbench.base.text import counted, did_you_mean, quoted
 from clbench.metrics.definitions import DEFINITIONS, FAMILIES, INSTEAD
 from clbench.scoring.intervals import interval
@@ -110,6 +111,8 @@ class Report:
         by_method = self.values[load_metric(metric).name]
         method = None if method is None else str(method)  # a table may name methods by numbers
         if method is not None and method not in by_method:
+            if "" in by_method:
+                raise UnknownNameError(f"These rates name no method: ask for {metric} without {method!r}.")
             raise unknown("method", method, by_method)
         return by_method[next(iter(by_method)) if method is None else method]
 

@@ -104,7 +104,7 @@ def evaluate_agent(
     scenario, stage = training.scenario, training.stage
     if stage is None:
         raise InputError(
-            f"{env} goes through all stages: make an environment of a single stage, for example with "
+            f"{env} is not of a single stage: make an environment that is, for example with "
             f"gymnasium.make({scenario.id!r}, stage=0)."
         )
     if training.order:

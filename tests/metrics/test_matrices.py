@@ -188,6 +188,11 @@ def test_a_method_may_be_named_by_a_number() -> None:
         report.of("final_average", 2)  # type: ignore[arg-type]
 
 
+def test_rates_without_a_name_are_asked_for_without_one() -> None:
+    with pytest.raises(UnknownNameError, match="name no method: ask for gain without 'mine'"):
+        from_matrix(TRIANGLE).of("gain", "mine")
+
+
 def test_a_tie_is_no_flip() -> None:
     assert from_matrix({"one": TRIANGLE, "other": TRIANGLE}).flips == ()
 

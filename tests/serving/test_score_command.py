@@ -8,6 +8,8 @@ from agents import ID
 from served import serving, write_policy
 
 from clbench.base.entry_points import resolve
+from clbench.base.errors import InputError
+from clbench.serving.client import ServedPolicy
 from clbench.serving.score import score
 
 STAGES = range(3)
@@ -121,3 +123,23 @@ def test_a_folder_that_cannot_be_written_is_named_before_the_server_is_looked_fo
     said = " ".join(capsys.readouterr().err.split())
     assert f"--records {file} cannot be written to: Not a directory." in said
     assert file.read_text() == "precious"
+
+
+@pytest.mark.long
+def test_a_stage_that_fails_ends_the_connection(
+    tmp_path: Path, empty_caches: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise InputError("the policy failed")
+
+    closed: list[ServedPolicy] = []
+    write_policy(tmp_path)
+    monkeypatch.setattr("clbench.serving.score.score", fail)
+    monkeypatch.setattr(ServedPolicy, "close", lambda served: closed.append(served))
+    command, options = (
+        resolve("clbench.cli.runs:score"),
+        {"stage": 0, "method": "me/elsewhere", "data": "by hand"},
+    )
+    with serving(tmp_path, 0) as (address, _), pytest.raises(SystemExit, match="2"):
+        command(ID, policy=address, records=tmp_path / "records", **options)
+    assert len(closed) == 1
