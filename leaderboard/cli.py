@@ -103,10 +103,12 @@ def show(
         print_json([dict(zip(column_names(), values_of(row), strict=True)) for row in shown.rows])
         _print_not_shown(shown, messages)
         return
-    with checked_input():
-        written = {} if computed is None else write_site(computed, records, inputs)
     console = Console()
-    console.print(terminal(shown, console.width, sort))
+    with checked_input():
+        try:
+            written = {} if computed is None else write_site(computed, records, inputs)
+        finally:  # the folder may be read-only
+            console.print(terminal(shown, console.width, sort))
     if written:
         print_written(written)
     else:

@@ -216,8 +216,8 @@ def _table(states: Sequence[RunState]) -> Table:
     """Return the number of runs in each state, by scenario and method."""
     shown = [name for name in STATES if any(state.state == name for state in states)]
     table = Table()
-    table.add_column("scenario", no_wrap=True)
-    table.add_column("method", overflow="fold")
+    for name in ("scenario", "method"):
+        table.add_column(name, overflow="fold")
     for name in shown:
         table.add_column(name, justify="right", no_wrap=True)
     for folder in dict.fromkeys(state.path.parent for state in states):

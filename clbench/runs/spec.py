@@ -63,6 +63,8 @@ class RunSpec:
                 raise WrongTypeError(f"{name} of a run must be a string, {hint}, not {value!r}.")
         if self.split not in get_args(ScoredSplit):
             raise InputError(f'split of a run must be "test" or "validation", not {self.split!r}.')
+        if not isinstance(self.changes, Mapping):
+            raise WrongTypeError(f"changes of a run must be values by name, not {self.changes!r}.")
         if type(self.perturb) is not bool:
             raise WrongTypeError(f"perturb of a run must be True or False, not {self.perturb!r}.")
         if is_whole(self.seed):

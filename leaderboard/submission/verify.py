@@ -37,6 +37,7 @@ from clbench.runs.run import execute, pretrained_hash
 from clbench.runs.spec import describe_scenario
 from clbench.scoring.metrics import measure
 from clbench.scoring.reading import is_number
+from clbench.spec.identifiers import without_module
 from clbench.spec.scenario import Scenario
 
 from ..board.runs import differences, read_run
@@ -185,13 +186,15 @@ def _recompute(subject: Subject, _: ProgressCallback) -> list[Check]:
     values = {name: measure(name, run.scores) for name in ("final_average", "adaptation", "retention")}
     result = ", ".join(f"{name} {'-' if value is None else f'{value:.3f}'}" for name, value in values.items())
     checks = [Check("metrics from its episodes", result, values["final_average"] is not None)]
+    name, named = run.record.scenario.id, subject.request.scenario
+    if named is not None and without_module(named) != name:  # a slip of the verifier says nothing against it
+        return [*checks, Check("what was run", f"it is of {name}, and --scenario names {named}", None)]
     try:
         scenario = subject.scenario
         info = None if subject.strange else subject.resolved.info
     except UnknownNameError as error:
         result = str(error.args[0])
-        if subject.request.scenario is None:
-            name = subject.run.record.scenario.id
+        if named is None:
             result = f"{result.partition('.')[0]}. Name its module: --scenario module:{name}"
         return [*checks, Check("what was run", result, None)]
     except ClbenchError as error:

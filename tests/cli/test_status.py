@@ -203,6 +203,18 @@ def test_names_of_folders_control_no_terminal(tmp_path: Path, capsys: pytest.Cap
     assert r"\x1b[2JToy/a[b]/seed-0: damaged" in shown
 
 
+def test_a_long_name_of_a_scenario_hides_no_method(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / f"me--{'Long' * 20}-v0" / "frozen"
+    folder.mkdir(parents=True)
+    (folder / "seed-0.json").write_text("{", encoding="utf-8")
+    monkeypatch.setenv("COLUMNS", "80")
+    resolve("clbench.cli.status:status")(records=tmp_path)
+    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("│")]
+    assert any("│ frozen │" in row for row in rows)
+
+
 @pytest.mark.long
 def test_every_state_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spec = RunSpec(TOY, "frozen", seed=0)

@@ -202,7 +202,7 @@ def test_a_folder_without_rows_lists_why_and_replaces_no_board(
 
 
 @pytest.mark.long
-def test_a_full_disk_leaves_every_file_of_the_board_as_it_was(
+def test_a_full_disk_leaves_every_file_of_the_board_as_it_was_and_shows_the_table(
     four_methods: Path,
     shown: Callable[[], tuple[str, str]],
     monkeypatch: pytest.MonkeyPatch,
@@ -224,8 +224,10 @@ def test_a_full_disk_leaves_every_file_of_the_board_as_it_was(
     with pytest.raises(SystemExit) as ended:
         shown()
     assert ended.value.code == 2
-    assert f"error: {written[1].parent}" in (message := capsys.readouterr().err)
+    out, message = capsys.readouterr()
+    assert f"error: {written[1].parent}" in message
     assert "cannot be written: No space left on device." in message
+    assert "from_scratch" in out
     assert {path.name: path.read_bytes() for path in site.iterdir()} == before
 
 

@@ -123,6 +123,7 @@ def test_a_wrong_name_or_value_is_refused_before_any_work(
         ({"split": "train"}, "split of a run must be"),
         ({"perturb": 1}, "perturb of a run must be True or False, not 1"),
         ({"device": 0}, "device of a run must be a string, such as 'cpu', not 0"),
+        ({"changes": [("rank", 4)]}, r"changes of a run must be values by name, not \[\('rank', 4\)\]"),
     ],
 )
 def test_an_impossible_run_is_refused_where_it_is_built(fields: dict[str, Any], message: str) -> None:
