@@ -202,10 +202,15 @@ def checked_writing(path: Path) -> Iterator[None]:
         raise InputError(f"{path} cannot be written: {error.strerror or error}.") from error
 
 
-def add_cwd_to_path() -> None:
-    """Let module:Class name a module in the working directory: a console script does not look there."""
+def check_cwd() -> None:
+    """Exit if the working directory was deleted: importing PyTorch would end the process without a reason."""
     with checked_input():
         try:
-            sys.path.insert(0, os.getcwd())
+            os.getcwd()
         except FileNotFoundError:
             raise InputError("The working directory no longer exists: change to another one.") from None
+
+
+def add_cwd_to_path() -> None:
+    """Let module:Class name a module in the working directory: a console script does not look there."""
+    sys.path.insert(0, os.getcwd())

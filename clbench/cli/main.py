@@ -13,7 +13,7 @@ from rich.logging import RichHandler
 
 import clbench
 from clbench.base.text import printable_lines
-from clbench.cli.arguments import parsing_error, read_paths
+from clbench.cli.arguments import check_cwd, parsing_error, read_paths
 from clbench.cli.data import DEMONSTRATIONS
 from clbench.cli.data import demonstrations as collect
 
@@ -80,6 +80,7 @@ def main() -> None:
     handler = RichHandler(console=Console(stderr=True), show_time=False, show_path=False)
     handler.addFilter(_made_printable)
     logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[handler])
+    check_cwd()
     app()
 
 

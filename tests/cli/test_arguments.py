@@ -1,12 +1,13 @@
 """Arguments of commands: paths that begin with the home folder, and errors of the input alone."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from clbench.base.errors import InputError
 from clbench.cli.arguments import (
-    add_cwd_to_path,
     checked_input,
     checked_writing,
     error_line,
@@ -33,16 +34,14 @@ def test_a_comma_inside_brackets_separates_no_items() -> None:
     assert items_of("--values.layers", "[[1,2],[3]],[[4]]") == ["[[1,2],[3]]", "[[4]]"]
 
 
-def test_a_working_directory_that_is_gone_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_working_directory_that_is_gone_is_named_before_anything_is_imported(tmp_path: Path) -> None:
     gone = tmp_path / "gone"
     gone.mkdir()
-    monkeypatch.chdir(gone)
-    gone.rmdir()
-    with pytest.raises(SystemExit, match="2"):
-        add_cwd_to_path()
-    assert "error: The working directory no longer exists: change to another one." in capsys.readouterr().err
+    code = f"import os; os.rmdir({str(gone)!r}); from clbench.cli.entry import main; main()"
+    command = [sys.executable, "-c", code, "pretrain", "clbench/Fetch-v1"]
+    ended = subprocess.run(command, cwd=gone, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2
+    assert ended.stderr == "error: The working directory no longer exists: change to another one.\n"
 
 
 @pytest.mark.parametrize("words", [["--records=~/somewhere"], ["--records", "~/somewhere"]])
