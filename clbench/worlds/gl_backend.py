@@ -113,15 +113,21 @@ def working_back_end(worlds: Iterable[str], chosen: str | None) -> str:
         chosen: The user's value of `MUJOCO_GL`, the only back end to try; None or empty tries all.
 
     Raises:
-        RenderingError: No back end draws them all; the message names the packages to install.
+        RenderingError: No back end draws them all. The message names the world that fails where a back end
+            works, else the packages to install.
     """
-    faults, needed = [], sorted(set(worlds))
+    needed = sorted(set(worlds))
+    faults: dict[str, tuple[str, str]] = {}
     for back_end in (chosen,) if chosen else _BACK_ENDS:
-        found = [fault for world in needed if (fault := rendering_fault(back_end, world))]
+        found = [(world, fault) for world in needed if (fault := rendering_fault(back_end, world))]
         if not found:
             return back_end
-        faults.append(f"{back_end} ({found[0]})")
-    message = f"The worlds cannot be drawn with {' or '.join(faults)}."
+        faults[back_end] = found[0]
+    for back_end, (world, fault) in faults.items():
+        if rendering_fault(back_end) is None:
+            raise RenderingError(f"{back_end} works on this machine, but cannot draw {world}: {fault}")
+    tried = " or ".join(f"{back_end} ({fault})" for back_end, (_, fault) in faults.items())
+    message = f"The worlds cannot be drawn with {tried}."
     if chosen:
         raise RenderingError(
             f"{message} MUJOCO_GL is set to {chosen}: unset it, and clbench chooses what works."
