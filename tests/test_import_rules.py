@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import ast
 import functools
-import subprocess
-import sys
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from helpers import output_of
 
 import clbench
 
@@ -266,14 +265,10 @@ def test_a_light_package_reaches_no_heavy_one(package: str) -> None:
     assert wrong == []
 
 
-def _run(code: str) -> str:
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-
-
 @pytest.mark.parametrize("imported", [*LIGHT, ", ".join(LIGHT)])
 def test_reading_scores_imports_neither_pytorch_nor_a_simulator(imported: str) -> None:
     heavy = "{'torch', 'mujoco', 'minari', 'gymnasium_robotics'}"
-    assert _run(f"import sys, {imported}; print({heavy} & set(sys.modules))") == "set()\n"
+    assert output_of(f"import sys, {imported}; print({heavy} & set(sys.modules))") == "set()"
 
 
 def test_no_module_has_more_than_450_lines() -> None:

@@ -3,18 +3,12 @@
 import dataclasses
 import pydoc
 import re
-import subprocess
-import sys
 
 import pytest
+from helpers import output_of
 
 import clbench
 from clbench.base.entry_points import resolve
-
-
-def _run(code: str) -> str:
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    return result.stdout.strip()
 
 
 def test_every_public_name_can_be_imported() -> None:
@@ -40,19 +34,19 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 def test_importing_registers_the_scenarios_and_loads_nothing_heavy() -> None:
     heavy = "{'torch', 'mujoco', 'pandas', 'minari', 'gymnasium_robotics', 'psutil', 'rich'}"
     code = "import clbench, gymnasium, sys; gymnasium.spec('clbench/Fetch-v1');"
-    assert _run(f"{code} print({heavy} & set(sys.modules))") == "set()"
+    assert output_of(f"{code} print({heavy} & set(sys.modules))") == "set()"
 
 
 def test_the_help_of_run_and_the_driver_of_ray_jobs_do_not_wait_for_pytorch() -> None:
     code = "import clbench.cli.main, clbench.cli.runs, clbench.jobs.ray, clbench.runs.spec, sys;"
-    assert _run(f"{code} print('torch' in sys.modules)") == "False"
+    assert output_of(f"{code} print('torch' in sys.modules)") == "False"
 
 
 @pytest.mark.long
 def test_nothing_leaks_to_the_top_level() -> None:
     code = "import clbench.cli.main, clbench.methods.sft, clbench.envs.fetch, clbench.leaderboard, sys;"
     code += "print({'envs', 'methods', 'leaderboard'} & set(sys.modules))"
-    assert _run(code) == "set()"
+    assert output_of(code) == "set()"
 
 
 def test_the_records_of_the_board_come_with_clbench() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-LATER = ("rule ", "camera")
-"""Prefixes of the names of parts that the first definitions lacked."""
+LATER = "rule "
+"""Prefix of the names of parts that the first definitions lacked."""
 
 
 def other_parts(recorded: Any, known: Mapping[str, str]) -> list[str]:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from helpers import output_of
 
 from clbench.base.source import (
     DATA_SOURCES,
@@ -308,8 +309,7 @@ def test_the_order_in_which_packages_are_named_does_not_matter() -> None:
 @pytest.mark.long
 def test_a_class_typed_at_a_prompt_has_a_hash() -> None:
     code = "from clbench.base.source import source_hash; print(len(source_hash('__main__')))"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "16"
+    assert output_of(code) == "16"
 
 
 @pytest.mark.long

@@ -106,39 +106,6 @@ def test_the_metrics_of_a_table_fit_the_terminal_and_cut_no_name(
     assert "read as per cent, since the greatest is 41.5" in " ".join(shown.split())
 
 
-def _shown(text: str, path: Path, capsys: pytest.CaptureFixture[str]) -> str:
-    """Return what `clbench metrics` prints for a table, in one line."""
-    path.write_text(text, encoding="utf-8")
-    app(["metrics", str(path), "--retained", "reach"], result_action="return_value")
-    return " ".join(capsys.readouterr().out.split())
-
-
-def _without(*starts: str) -> str:
-    """Return the table without the lines that start with one of these texts."""
-    return "".join(line for line in TABLE.splitlines(keepends=True) if not line.startswith(starts))
-
-
-def test_a_value_without_an_interval_beside_others_says_why(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "table.csv"
-    shown = _shown(TABLE, path, capsys)
-    assert "kept_targets: higher is better experience_replay 0.500 (seeds agree) sft 0.250 [" in shown
-    assert "sft 0.300 (one seed)" in _shown(_without("sft,1"), path, capsys)
-    assert "(one seed)" not in _shown(_without("sft,1", "experience_replay,1"), path, capsys)
-
-
-def test_flips_come_with_the_number_of_seeds_since_they_may_be_noise(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "table.csv"
-    heading = "Where the order of methods flips"
-    noise = f"{heading} With 2 seeds a difference may be noise: look at the intervals. average:"
-    assert noise in _shown(TABLE, path, capsys)
-    one_seed = _shown(_without("sft,1", "experience_replay,1"), path, capsys)
-    assert f"{heading} With one seed a difference may be noise: there are no intervals. " in one_seed
-
-
 def test_the_metrics_of_a_table_are_printed_as_json_with_reasons_and_flips(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -7,7 +7,6 @@ import copy
 import dataclasses
 import itertools
 import re
-import subprocess
 import sys
 import warnings
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +16,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from helpers import back_end_or_skip, expert_succeeds
+from helpers import back_end_or_skip, expert_succeeds, output_of
 from numpy.typing import NDArray
 
 from clbench.base.dependencies import require_packages
@@ -104,17 +103,15 @@ def first_task_of_each_world(scenario: Scenario) -> list[Task]:
     return list(worlds.values())
 
 
-def run(program: str) -> None:
-    subprocess.run([sys.executable, "-c", program], check=True)
-
-
 @pytest.mark.long
 def test_the_data_of_all_scenarios_load_no_simulator() -> None:
-    run(
+    simulators = "{'mujoco', 'gymnasium_robotics', 'dm_control', 'libero', 'metaworld'}"
+    code = (
         "import clbench.spec.task, sys\n"
         f"for name in {BUILT_IN}: clbench.spec.registry.registered_scenario(name)\n"
-        "assert not {'mujoco', 'gymnasium_robotics', 'dm_control', 'libero', 'metaworld'} & set(sys.modules)"
+        f"print({simulators} & set(sys.modules))"
     )
+    assert output_of(code) == "set()"
 
 
 @pytest.mark.long
@@ -127,14 +124,14 @@ def test_the_data_of_all_scenarios_load_no_simulator() -> None:
 )
 def test_an_outsiders_script_makes_it_without_an_import_and_without_pytorch(scenario: Scenario) -> None:
     make_environment(scenario).close()
-    run(
+    shown = output_of(
         "import gymnasium, sys\n"
         f"environment = gymnasium.make('clbench:{scenario.id}')\n"
         "environment.reset(seed=0)\n"
         "environment.step(environment.action_space.sample())\n"
-        f"assert environment.unwrapped.scenario.id == '{scenario.id}'\n"
-        "assert 'torch' not in sys.modules"  # it takes seconds to import
+        "print(environment.unwrapped.scenario.id, 'torch' in sys.modules)"  # it takes seconds to import
     )
+    assert shown.splitlines()[-1] == f"{scenario.id} False"
 
 
 @pytest.mark.parametrize("instruction", ["text", "tokens"])
@@ -206,7 +203,7 @@ def test_an_episode_without_a_seed_continues_the_random_numbers(scenario: Scenar
 @every_scenario
 def test_episodes_side_by_side_equal_the_plain_world_bit_for_bit(scenario: Scenario) -> None:
     tasks = [*scenario.tasks[:2], *scenario.tasks[-3:]]
-    plain, lanes = [make(task) for task in tasks], Lanes(5, threads=2)
+    plain, lanes = [make(task) for task in tasks], Lanes(5, threads=3)
     states = lanes.reset([4, 2, 0], [4, 2, 0], [tasks[4], tasks[2], tasks[0]])
     for row, lane in enumerate([4, 2, 0]):
         state, _ = plain[lane].reset(seed=lane, options={"task": tasks[lane].name})
@@ -329,7 +326,7 @@ def test_no_task_is_done_at_the_start(scenario: Scenario) -> None:
     worlds = {task.world: make(task) for task in scenario.tasks}
     for task in scenario.tasks:
         world = worlds[task.world]
-        for seed in range(5):
+        for seed in range(20):
             _, info = world.reset(seed=seed, options={"task": task.name})
             assert info == {"success": False, "task": task.name}
             assert not world.step(np.zeros_like(actions(world, 0, 1)[0]))[2]

@@ -75,14 +75,11 @@ def test_physics_and_observation_equal_fetch_pick_and_place(seed: int) -> None:
 
 
 @pytest.mark.parametrize("task", NAMES)
-def test_no_task_is_done_at_the_start(task: str) -> None:
+def test_a_block_starts_in_the_gripper_or_apart_from_it(task: str) -> None:
     world = World()
     for seed in range(20):
-        state, info = world.reset(seed=seed, options={"task": task})
-        assert info == {"success": False, "task": task}
-        held = RULES[task].layout.block_held
-        assert held or np.linalg.norm(state[6:8]) >= 0.099, "the block starts apart from the gripper"
-        assert not world.step(np.zeros(4, np.float32))[2]
+        state, _ = world.reset(seed=seed, options={"task": task})
+        assert RULES[task].layout.block_held or np.linalg.norm(state[6:8]) >= 0.099
 
 
 def test_a_block_in_front_starts_in_the_same_place_for_every_task() -> None:

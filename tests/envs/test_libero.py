@@ -104,21 +104,6 @@ def test_a_hundred_episodes_of_twenty_tasks_do_so() -> None:
         assert fresh_trails(start, 40).items() <= expected.items()
 
 
-def test_lanes_and_threads_do_not_change_a_bit() -> None:
-    tasks, seeds = [OPEN, MILK, BOWL, OPEN], [1, 2, 3, 4]
-    actions = np.stack([random_actions(seed, 10) for seed in seeds], axis=1)
-    for threads in (1, 3):
-        world = vector_world(WORLD, 5, threads)
-        states = [world.reset([4, 1, 2, 0], seeds, tasks)]
-        states += [world.step([4, 1, 2, 0], batch)[0] for batch in actions]
-        world.close()
-        for row, (task, seed) in enumerate(zip(tasks, seeds, strict=True)):
-            plain = World()
-            alone = [plain.reset(seed=seed, options={"task": task})[0]]
-            alone += [plain.step(action)[0] for action in actions[:, row]]
-            np.testing.assert_array_equal(np.stack(states)[:, row], alone)
-
-
 def test_seeds_below_fifty_are_liberos_initial_states_with_fixtures_of_their_own() -> None:
     problem, episode = problem_of(OPEN), Episode(problem_of(OPEN))
     for seed in (0, 49):

@@ -1,6 +1,5 @@
 """The physics of Meta-World, compared bit for bit with the plain world and with Meta-World itself."""
 
-import itertools
 from typing import Any
 
 import mujoco
@@ -24,8 +23,8 @@ PHYSICS = resolve("clbench.envs.metaworld.episode:PHYSICS")
 State = NDArray[np.float32]
 
 
-def metaworld(lanes: int, threads: int = 1) -> VectorWorld:
-    return vector_world(WORLD, lanes, threads)
+def metaworld(lanes: int) -> VectorWorld:
+    return vector_world(WORLD, lanes)
 
 
 class Peer:
@@ -135,25 +134,6 @@ def test_it_is_the_plain_world_and_meta_world_bit_for_bit(task: str) -> None:
 @pytest.mark.parametrize("task", list(TASKS))
 def test_it_stays_so_over_ten_thousand_steps_of_each_task(task: str) -> None:
     assert compare(task, steps=10_000) > 5
-
-
-def test_lanes_step_in_any_order_and_number_without_a_trace_in_the_others() -> None:
-    world, plain = metaworld(lanes=5, threads=3), [PlainWorld() for _ in range(5)]
-    tasks = ["push", "push", "drawer_open"]
-    states = world.reset([4, 2, 0], [4, 2, 0], tasks)
-    for row, lane in enumerate([4, 2, 0]):
-        expected = plain[lane].reset(seed=lane, options={"task": tasks[row]})[0]
-        np.testing.assert_array_equal(expected, states[row])
-    actions = np.random.default_rng(0).uniform(-1, 1, (30, 5, 4)).astype(np.float32)
-    for step, moving in zip(range(30), itertools.cycle([[4, 2, 0], [0], [2, 4], [0, 4]])):
-        states, rewards, _ = world.step(moving, actions[step, moving])
-        for row, lane in enumerate(moving):
-            state, reward, *_ = plain[lane].step(actions[step, lane])
-            assert states[row].tobytes() == state.tobytes()
-            assert rewards[row] == reward
-        if step == 15:
-            world.reset([1, 3], [9, 9], ["push", "drawer_open"])
-    world.close()
 
 
 def test_a_lane_that_begins_another_task_leaves_its_place_to_others() -> None:

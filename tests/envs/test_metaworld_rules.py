@@ -1,7 +1,6 @@
 """Computations for many episodes at once, compared bit for bit with Meta-World's own steps."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import pytest
@@ -98,25 +97,13 @@ def test_lanes_of_a_task_equal_meta_worlds_own_steps(task: str) -> None:
 
 
 @pytest.mark.long
-def test_lanes_of_all_tasks_do_so_in_any_order_on_two_threads_with_and_without_rules() -> None:
-    compare([*TASKS, *TASKS[::3], "stick_push", "dial_turn"], steps=40, threads=2)
+def test_lanes_of_all_tasks_do_so_in_any_order_on_three_threads_with_and_without_rules() -> None:
+    compare([*TASKS, *TASKS[::3], "stick_push", "dial_turn"], steps=40, threads=3)
 
 
 @pytest.mark.long
 def test_perturbed_lanes_of_all_tasks_do_so() -> None:
     compare([*TASKS, *TASKS[::3]], steps=20, perturbed=True)
-
-
-def test_threads_do_not_change_a_bit() -> None:
-    tasks, lanes = ["push", "drawer_open", "push", "push", "stick_push", "push"], list(range(6))
-    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (30, 6, 4)).astype(np.float32)
-    trails: list[list[Any]] = []
-    for threads in (1, 2, 5):
-        world = vector_world(WORLD, 6, threads)
-        trails.append([world.reset(lanes, lanes, tasks).tobytes()])
-        trails[-1] += [part.tobytes() for batch in actions for part in world.step(lanes, batch)]
-        world.close()
-    assert trails[0] == trails[1] == trails[2]
 
 
 @pytest.mark.slow

@@ -191,7 +191,7 @@ def test_a_definition_of_another_form_differs_as_a_whole() -> None:
     known = {"task left": "a", "questions": "b"}
     assert other_parts(None, known) == []  # an older record
     assert other_parts({"task left": "a"}, known) == ["questions"]
-    assert other_parts(known, {**known, "rule left": "c", "camera": "d"}) == []  # older than these parts
+    assert other_parts(known, {**known, "rule left": "c"}) == []  # older than rules
     assert other_parts({**known, "rule left": "b"}, {**known, "rule left": "c"}) == ["rule left"]
     strangers: list[Any] = [[], "x", {"task left": "a", "questions": "b", "\x1b[2J": "c"}]
     for strange in strangers:

@@ -8,6 +8,8 @@ import io
 import json
 import os
 import re
+import subprocess
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -44,6 +46,12 @@ def reverse_targets(record: Record) -> None:
     swapped = dict(zip(target, reversed(target), strict=True))
     target.reverse()
     record.episodes["task"] = [swapped.get(task, task) for task in record.episodes["task"]]
+
+
+def output_of(code: str) -> str:
+    """Return what a Python program prints in a process of its own, which must succeed."""
+    command = [sys.executable, "-c", code]  # what it says of an error goes to the report of the test
+    return subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
 
 
 def scenario_or_skip(scenario_id: str) -> Scenario:

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from helpers import output_of
 
 from clbench.worlds.threads import Copies, Team, cores
 
@@ -137,8 +138,7 @@ def test_only_the_cores_that_this_process_may_use_count(
 ) -> None:
     code = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
     code += "from clbench.worlds.threads import cores; print(cores())"
-    one = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert int(one.stdout) == 1
+    assert output_of(code) == "1"
     monkeypatch.setattr("clbench.worlds.threads.PROCESS_CGROUPS", tmp_path / "no cgroup")
     assert cores() == len(os.sched_getaffinity(0))
 

@@ -9,10 +9,13 @@ from playwright.sync_api import Browser, sync_playwright
 
 @pytest.fixture(scope="package")
 def browser() -> Iterator[Browser]:
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    if chromium is None:
+        pytest.skip("there is no chromium: apt-get install chromium")
     with sync_playwright() as playwright:
         # A container has no user namespaces and little shared memory.
         started = playwright.chromium.launch(
-            executable_path=shutil.which("chromium") or shutil.which("chromium-browser"),
+            executable_path=chromium,
             args=["--no-sandbox", "--disable-dev-shm-usage"],
         )
         yield started

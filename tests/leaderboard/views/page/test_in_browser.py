@@ -1,7 +1,6 @@
 """The page in a browser, opened from disk: what a reader does by mouse, by keys, on a phone, in the dark."""
 
 import re
-import shutil
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -15,16 +14,12 @@ from clbench.records.paths import record_path
 from clbench.records.record import Record
 from clbench.records.writer import write_record
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 HOSTILE = "</script><img src=x onerror=alert(1)>"
 REPLAY = {"demonstrations": "throughout", "questions": "never", "reference": False}
 MATRIX = np.array([[1.0, 0.8, 0.1, 0.0, 0.2], [0.6, 0.9, 0.9, 0.2, 0.3], [0.5, 0.4, 0.3, 0.8, 0.1]])
 DESKTOP, PHONE = {"width": 1280, "height": 860}, {"width": 390, "height": 844}
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not CHROMIUM, reason="there is no chromium: apt-get install chromium"),
-]
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,6 @@
 """The published page: what a researcher learns from its first screen, and how soon."""
 
 import json
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,15 +9,11 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Locator, Page, expect
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 SITE = Path(__file__).parents[4] / "leaderboard" / "site"
 SIZES = [{"width": 1440, "height": 900}, {"width": 390, "height": 844}]
 MAIN = "clbench/Fetch-v1"
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not CHROMIUM, reason="there is no chromium: apt-get install chromium"),
-]
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(params=SIZES, ids=["desktop", "phone"])
