@@ -17,7 +17,7 @@ make check        the next three, side by side with -j3
 make style        format and lint
 make types        types
 make committed    whether committed pages and definitions are those of the records and the code; the page in a browser
-make libero-test  install LIBERO (340 MB), and compare our world with it
+make libero-test  install LIBERO (1.7 GB), and compare our world with it
 make wheel-test   build the wheel, and test it outside the clone
 make site         the documentation as a site: build/site/index.html
 make docs         the pages of docs/reference, from the code and the records
@@ -160,7 +160,7 @@ test-long: .venv/installed-dev
 test-slow: .venv/installed-dev
 	$(BIN)/pytest -m slow
 
-# LIBERO's scenario, and its world beside LIBERO's own, which the extra brings: 340 MB. Elsewhere its tests are skipped.
+# LIBERO's scenario, and its world beside LIBERO's own, which the extra brings: 1.7 GB. Elsewhere its tests are skipped.
 libero-test: .venv/installed-libero
 	$(BIN)/pytest tests/envs/test_libero.py tests/envs/test_libero_physics.py tests/envs/test_libero_scenario.py
 	$(BIN)/pytest tests/envs/test_every_scenario.py -k Libero

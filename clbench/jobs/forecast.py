@@ -101,7 +101,7 @@ def _disk(
     # the next checkpoint is written before the last one is removed; a method's state is not counted
     meanwhile = 2 * min(at_once, len(runs)) * max(policies.values())
     parts = [
-        f"about {_megabytes(made)} in the caches",
+        f"up to {_megabytes(made)} in the caches",
         f"{_megabytes(meanwhile)} more while runs go on",
         f"{_megabytes(records)} of records",
     ]
@@ -146,11 +146,11 @@ def _policy_bytes(scenario: Scenario) -> int:
 
 
 def _data_bytes(scenario: Scenario) -> int:
-    """Return the most bytes that the demonstrations of a scenario can take, with episodes of full length."""
+    """Return the bytes that demonstrations and their pictures take at most, with episodes of full length."""
     config = policy_config(scenario)
-    numbers = 4 * (config.state_size + 3 * config.action_size + 4)
+    step = 4 * (config.state_size + 3 * config.action_size + 4) + 3 * config.image_size**2
     tasks = scenario.tasks + scenario.background
-    return numbers * scenario.budget.demonstrations * sum(task.horizon for task in tasks)
+    return step * scenario.budget.demonstrations * sum(task.horizon for task in tasks)
 
 
 def _duration(seconds: float) -> str:

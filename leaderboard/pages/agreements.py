@@ -14,7 +14,6 @@ from clbench.scoring.metrics import load_metric
 from ..board.agreement import (
     LEAST_ROWS,
     SIGNIFICANCE,
-    Agreement,
     Concordance,
     RankCorrelation,
     agreement_between,
@@ -101,7 +100,7 @@ def _w_text(found: Concordance | None) -> str:
 
 def _of_scenarios(boards: Mapping[str, list[Row]]) -> tuple[list[str], Table, str]:
     """Return how alike two scenarios order the methods that both have."""
-    pairs: list[tuple[str, Agreement, Agreement | None]] = []
+    pairs: list[tuple[str, RankCorrelation, RankCorrelation | None]] = []
     for (one, rows), (other, others) in combinations(boards.items(), 2):
         if across := _between(rows, others):
             rest = _between(*(without_demonstrations(them) for them in (rows, others)))
@@ -271,7 +270,7 @@ def _shares_of_variance(rows: Sequence[Row]) -> tuple[str, str]:
     return f"{of_methods:.0%}", f"{of_seeds:.0%}"
 
 
-def _between(rows: Sequence[Row], others: Sequence[Row]) -> Agreement | None:
+def _between(rows: Sequence[Row], others: Sequence[Row]) -> RankCorrelation | None:
     """Return the agreement of two scenarios on the order of the methods that both have."""
     one, other = _common(rows, others, RANKED_BY, RANKED_BY)
     return agreement_between(one, other) if len(one) else None

@@ -280,7 +280,7 @@ def test_a_dry_run_says_what_would_be_done_and_does_nothing(
     assert re.fullmatch(
         r"Time: about \d+ minutes? with 1 at once, at \d+ ms for an optimiser step here\.", duration
     )
-    sizes = r"about .* in the caches, .* more while runs go on, 400 kB of records, .* of policies in kept"
+    sizes = r"up to .* in the caches, .* more while runs go on, 400 kB of records, .* of policies in kept"
     assert re.fullmatch(rf"Disk: {sizes}\.", disk)
     assert not any(path.is_file() for path in empty_caches.rglob("*"))
 

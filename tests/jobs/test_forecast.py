@@ -16,6 +16,7 @@ from clbench.jobs.job import Job
 from clbench.learning.pretraining import policy_config
 from clbench.policy.transformer import TransformerPolicy
 from clbench.runs.spec import RunSpec
+from clbench.testing.seen_toy import SEEN_TOY
 
 
 def _plan(*jobs: Job) -> Any:
@@ -99,9 +100,19 @@ def test_the_disk_is_that_of_policies_demonstrations_and_records(monkeypatch: py
     sizes = (made, meanwhile, kept)
     words = [f"{count / 1e3:.0f} kB" if count < 1e6 else f"{count / 1e6:.0f} MB" for count in sizes]
     assert disk == (
-        f"Disk: about {words[0]} in the caches, {words[1]} more while runs go on, 300 kB of records, "
+        f"Disk: up to {words[0]} in the caches, {words[1]} more while runs go on, 300 kB of records, "
         f"{words[2]} of policies in kept."
     )
+
+
+def test_the_disk_holds_the_pictures_of_demonstrations(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "step_seconds", lambda _: 0.1)
+    runs = [RunSpec("clbench.testing.seen_toy:clbench/SeenToy-v0", "sft", 0).resolve()]
+    _, _, disk = forecast(_plan(_job(work.do_run, 1)), runs, 1, None)
+    config, steps = policy_config(SEEN_TOY), sum(task.horizon for task in SEEN_TOY.tasks)
+    numbers = 4 * (config.state_size + 3 * config.action_size + 4)
+    data = (numbers + 3 * config.image_size**2) * SEEN_TOY.budget.demonstrations * steps
+    assert disk.startswith(f"Disk: up to {data / 1e3:.0f} kB in the caches")
 
 
 def test_the_time_of_a_step_is_the_median_without_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
