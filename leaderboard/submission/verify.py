@@ -396,7 +396,8 @@ def _job(path: Path, records: Path, request: Request, report: Path) -> Job:
         if request.tier != "recomputed":
             device = subject.spec.device
             length += len(scenario.target) * scenario.budget.adaptation_steps
-            length += 0.0 if is_pretrained(scenario, subject.spec.seed) else pretraining_length(scenario)
+            if not subject.strange and not is_pretrained(scenario, subject.spec.seed):
+                length += pretraining_length(scenario)
         if request.tier == "retrained":
             length += run_length(scenario, subject.protocol)
             length += 0.0 if subject.strange else watching_length(subject.resolved.method, scenario)

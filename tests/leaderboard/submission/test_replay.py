@@ -5,6 +5,7 @@ import hashlib
 import importlib
 import json
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from clbench.evaluation.rollouts import Evaluator
 from clbench.jobs.job import Job
 from clbench.learning.method import Method
 from clbench.policy.policy import Policy
+from clbench.records.paths import record_name
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.spec.registry import load_scenario
@@ -347,3 +349,19 @@ def test_the_bar_of_a_replay_counts_the_pretraining_that_the_replay_needs(
     request = subject.Request(tier="replayed", episodes=20, seed=0, scenario=TOY)
     (outcome,) = verifier.run_verifications([mine], mine.parents[2], request, 1, Console())
     assert [check["found"] for check in outcome.checks if check["passed"] is False] == []
+
+
+def test_the_bar_of_a_verification_imports_no_policy_that_a_record_alone_names(
+    mine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "evil_policy.py").write_text("", encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    edit(mine, lambda values: values["run"].update(policy="evil_policy:Policy"))
+    records = mine.parents[2]
+    theirs = records / record_name("clbench/Toy-v0", "sft", 0, 0, "evil_policy:Policy")
+    theirs.parent.mkdir(parents=True)
+    mine.rename(theirs)
+    monkeypatch.setattr(verifier, "run_with_bars", lambda *_: {})
+    request = subject.Request(tier="replayed", episodes=20, seed=0, scenario=TOY)
+    verifier.run_verifications([theirs], records, request, 1, Console())
+    assert "evil_policy" not in sys.modules
