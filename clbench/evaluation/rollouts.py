@@ -15,13 +15,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from clbench.base.errors import WrongTypeError
+from clbench.base.errors import UnknownNameError, WrongTypeError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import torch_generator
+from clbench.base.text import listed
 from clbench.evaluation.episodes import LANES, Episode, Live, Trial, Watch, play_in_lanes
 from clbench.policy.policy import Policy, evaluating
 from clbench.spec.language import encode
-from clbench.spec.protocol import Split
+from clbench.spec.protocol import SPLITS, Split
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 from clbench.worlds.lanes import Lanes
@@ -37,9 +38,16 @@ class Evaluator:
         seed: Seed of the run: it chooses the initial states, the same for all methods.
         threads: Number of threads that may step the worlds; no outcome depends on it.
         lanes: Number of episodes that step together, and of rows in every forward pass.
+
+    Raises:
+        WrongTypeError: `scenario` is something other than a Scenario, such as an id.
     """
 
     def __init__(self, scenario: Scenario, seed: int, threads: int = 1, lanes: int = LANES) -> None:
+        if not isinstance(scenario, Scenario):
+            raise WrongTypeError(
+                f"A Scenario is needed, not {scenario!r}: clbench.load_scenario(ID) returns one."
+            )
         self.scenario = scenario
         self.seed = seed
         self._lanes = Lanes(lanes, threads)
@@ -65,9 +73,19 @@ class Evaluator:
             progress: Called with the number of episodes that have ended since its last call.
 
         Raises:
+            WrongTypeError: `tasks` has something other than tasks, or is a single one.
+            UnknownNameError: No split is called `split`.
             LeakError: A hook asks for other episodes than validation episodes of tasks whose
                 demonstrations it may read.
         """
+        if isinstance(tasks, Task):
+            raise WrongTypeError(f"Give a list of tasks, not the task {tasks.name!r} alone.")
+        tasks = list(tasks)
+        for task in tasks:
+            if not isinstance(task, Task):
+                raise WrongTypeError(f"A Task is needed, not {task!r}: Scenario.task(NAME) returns one.")
+        if split not in SPLITS:
+            raise UnknownNameError(f"No split is called {split!r}; there are {listed(SPLITS)}.")
         numbers = range(self.scenario.budget.episodes(split))
         return self.play(
             policy, [Trial(task, split, number) for task in tasks for number in numbers], progress

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from clbench.base.entry_points import resolve
-from clbench.base.errors import WrongTypeError
+from clbench.base.errors import UnknownNameError, WrongTypeError
 from clbench.base.seeding import derive_seed, torch_generator
 from clbench.data.questions import load_questions, scored_questions
 from clbench.evaluation.answers import answer
@@ -92,6 +92,18 @@ def test_an_outcome_equals_the_outcome_in_the_plain_world_bit_for_bit(fetch_poli
             alone = [_played_alone(policy, task, number, seed=4) for task, _, number in trials]
             for threads in (1, 2):
                 assert Evaluator(scenario, seed=4, threads=threads).play(policy, trials) == alone
+
+
+def test_an_evaluator_asks_for_scenarios_tasks_and_splits_by_kind_and_name(fetch_policy: Policy) -> None:
+    with pytest.raises(WrongTypeError, match="A Scenario is needed, not 'clbench/Fetch-v1'"):
+        Evaluator("clbench/Fetch-v1", 0)  # type: ignore[arg-type]
+    evaluator, task = Evaluator(FETCH, 0), FETCH.task("reach")
+    with pytest.raises(WrongTypeError, match="Give a list of tasks, not the task 'reach' alone"):
+        evaluator.evaluate(fetch_policy, task)  # type: ignore[arg-type]
+    with pytest.raises(WrongTypeError, match="A Task is needed, not 'reach'"):
+        evaluator.evaluate(fetch_policy, ["reach"])  # type: ignore[list-item]
+    with pytest.raises(UnknownNameError, match="there are validation, test and perturbed"):
+        evaluator.evaluate(fetch_policy, [task], "val")  # type: ignore[arg-type]
 
 
 def test_a_row_of_a_forward_pass_does_not_depend_on_its_place_or_its_neighbours(fetch_policy: Policy) -> None:
