@@ -136,8 +136,18 @@ def diagnostics(runs: Sequence[Run]) -> Diagnostics:
     return Diagnostics(tuple(map(text_of, stages)), tuple(found))
 
 
-def _mean(values: Sequence[Any]) -> tuple[str, str]:
-    """Return the mean over seeds as text and as a line; for values other than numbers, what all share."""
+def _mean(of_seeds: Sequence[Any]) -> tuple[str, str]:
+    """Return the mean over seeds as text and as a line; for values other than numbers, what all share.
+
+    A seed without a value does not count: its policy met the criterion before the first step of the stage.
+    """
+    values = [value for value in of_seeds if value is not None]
+    text, line = _mean_of_all(values) if values else ("none", "")
+    fewer = "" if len(values) in (0, len(of_seeds)) else f" ({len(values)} of {len(of_seeds)} seeds)"
+    return text + fewer, line
+
+
+def _mean_of_all(values: Sequence[Any]) -> tuple[str, str]:
     if all(map(is_number, values)):
         return text_of(float(np.mean(values))), ""
     lengths = {

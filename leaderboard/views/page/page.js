@@ -424,6 +424,18 @@
     go();
   });
 
+  dialog.addEventListener("click", async ({ target }) => {
+    if (!target.matches(".copy")) return;
+    const commands = target.parentElement.nextElementSibling;
+    try {
+      await navigator.clipboard.writeText(commands.textContent);
+      target.textContent = "Copied";
+    } catch { // the browser forbids it, or offers it to pages of https alone
+      getSelection().selectAllChildren(commands);
+      target.textContent = "Selected";
+    }
+  });
+
   dialog.addEventListener("close", () => {
     dialog.replaceChildren();
     const own = document.querySelector(`.board .name a[href="#${CSS.escape(opened)}"]`);

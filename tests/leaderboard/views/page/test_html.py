@@ -199,6 +199,23 @@ def test_the_same_records_give_the_same_bytes_in_another_place_time_zone_and_loc
     assert [(elsewhere / "leaderboard" / "site" / name).read_bytes() for name in names] == here
 
 
+def test_a_diagnostic_is_a_mean_over_the_seeds_that_have_it(add: Callable[..., Path], records: Path) -> None:
+    def learned_before_the_first_step(record: Record) -> None:
+        record.diagnostics = {"1": {"shed": 0.5, "way": [1.0, 3.0]}}
+
+    def trained(record: Record) -> None:
+        record.diagnostics = {stage: {"shed": 0.25, "way": [2.0, 4.0]} for stage in ("1", "2")}
+
+    add("sft", 0, edit=learned_before_the_first_step)
+    add("sft", 1, edit=trained)
+    html = data_of(page(compute_board(records), {}))["rows"]["clbench/Toy-v0/sft"]["html"]
+    shed, way = (re.search(rf'row">{name}</th>(.*)</tr>', html) for name in ("shed", "way"))
+    assert shed
+    assert way
+    assert re.findall(r">([^<>]+)<", shed[1]) == ["0.375", "0.25 (1 of 2 seeds)"]
+    assert re.findall(r">([^<>]+)<", way[1]) == ["1.5 → 3.5", "2 → 4 (1 of 2 seeds)"]
+
+
 def test_texts_of_strangers_stay_text(add: Callable[..., Path], records: Path) -> None:
     def edit(record: Record) -> None:
         record.run.settings = {HOSTILE: HOSTILE}

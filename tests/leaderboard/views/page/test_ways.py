@@ -251,3 +251,24 @@ def test_the_meaning_of_a_definition_is_reached_by_keyboard(open_page: Callable[
     expect(page.locator("#tip")).to_be_visible()
     page.keyboard.press("ArrowRight")
     expect(page.locator("#tip")).to_have_text(heads.nth(1).get_attribute("data-note") or "")
+
+
+@pytest.mark.parametrize(("allowed", "then"), [(True, "Copied"), (False, "Selected")])
+def test_a_click_copies_the_commands_of_a_row_or_selects_them(
+    allowed: bool, then: str, open_page: Callable[[str], Page]
+) -> None:
+    page = open_page(f"#{EVEN}/sft")
+    page.evaluate(
+        """allowed => Object.defineProperty(navigator, "clipboard", {value: {
+            writeText: async (text) => { if (!allowed) throw new Error("forbidden"); window.copied = text; }
+        }})""",
+        allowed,
+    )
+    page.get_by_role("button", name="Copy").click()
+    expect(page.get_by_role("button", name=then)).to_be_visible()
+    commands = page.locator("dialog pre").inner_text()
+    assert "clbench run" in commands
+    assert (
+        page.evaluate("allowed => allowed ? window.copied : getSelection().toString()", allowed).strip()
+        == commands.strip()
+    )
