@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clbench.base.cache import hash_of
+from clbench.base.errors import InputError
 from clbench.base.leftovers import sweep
 from clbench.base.source import package_of, source_hash
 from clbench.base.strict_json import StrictJSONError, read_regular
@@ -110,6 +111,8 @@ def _folder_hash(folder: Path) -> str:
 def read_unchanged(records: Path, inputs: dict[str, str]) -> Summary | None:
     """Return the numbers of the board, None unless every file of the site is whole and made from `inputs`."""
     site = site_of(records)
+    if site.is_symlink():
+        return None
     try:
         kept: dict[str, Any] = json.loads(read_regular(site / NUMBERS, MOST_OF_A_SITE))
         files = {name: _hash_of_bytes(read_regular(site / name, MOST_OF_A_SITE)) for name in kept["files"]}
@@ -131,7 +134,14 @@ def read_board(records: Path) -> Summary:
 
 
 def write_site(board: Board, records: Path, inputs: dict[str, str]) -> dict[Path, bool]:
-    """Write every form of the board to the folder of the board, and return which files changed."""
+    """Write every form of the board to the folder of the board, and return which files changed.
+
+    Raises:
+        InputError: The folder is a link, or the file system refuses one of the files.
+    """
+    site = site_of(records)
+    if site.is_symlink():
+        raise InputError(f"{site} is a symbolic link, which is not followed. Put a folder in its place.")
     # They load the charts, SciPy and PyTorch: 3 s.
     from .policies.compared import by_table
     from .views import page as web_page
@@ -147,12 +157,12 @@ def write_site(board: Board, records: Path, inputs: dict[str, str]) -> dict[Path
     files = {name: _hash_of_bytes(text.encode()) for name, text in texts.items()}
     kept = {"made_from": inputs, "files": files, "board": board.to_json()}
     texts[NUMBERS] = json.dumps({**kept, "content": content_hash(kept)}, indent=1) + "\n"
-    site = site_of(records)
     sweep(site)
     former = _files_of(site)
     written = write_all({site / name: text for name, text in texts.items()})
     for name in former - texts.keys():  # such as the picture of a frontier that no longer exists
-        (site / name).unlink(missing_ok=True)
+        if (site / name).is_file():  # a stranger's list may name "..", too
+            (site / name).unlink()
     return written
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass, replace
@@ -22,6 +23,7 @@ from clbench.base.cache import cached
 from clbench.base.errors import ClbenchError, UnknownNameError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.strict_json import StrictJSONError, read_regular
+from clbench.base.text import printable
 from clbench.data.demonstrations import simulator_versions
 from clbench.jobs.job import Job, JobError
 from clbench.jobs.processes import Processes
@@ -89,6 +91,8 @@ def verify(
         request: Options of the verification.
         progress: Called with the work done since its last call, in optimiser steps.
     """
+    if not Path(os.path.realpath(path.parent)).is_relative_to(os.path.realpath(records)):
+        return [Check("record", f"{path.parent}: a symbolic link leads out of {records}.", None)]
     digest = _digest(path)  # before it is read: the tier holds for these bytes alone
     try:
         run = read_run(records, path, changed=None)
@@ -232,6 +236,8 @@ def _check_what_was_run(subject: Subject, info: RunInfo | None) -> Check:
         pairs["run"] = record.run, info
     pairs["scenario"] = record.scenario, describe_scenario(subject.learned)
     wrong = [f"{part}.{name}" for part, pair in pairs.items() for name in differences(*map(vars, pair))]
+    if info is not None and _lacks_its_curve(subject):
+        wrong.append("episodes before the ends of stages")
     if wrong:
         return Check("what was run", f"{', '.join(wrong)} differ from the installed code", False)
     if info is None:
@@ -239,6 +245,16 @@ def _check_what_was_run(subject: Subject, info: RunInfo | None) -> Check:
         unseen = f"{names} is not installed: its settings were not compared with its class"
         return Check("what was run", f"matches the scenario; {unseen}", True)
     return Check("what was run", "matches its class and the scenario", True)
+
+
+def _lacks_its_curve(subject: Subject) -> bool:
+    """Return whether a record has no episodes before the ends of stages, although its method has them.
+
+    The reader takes such a record for one of a method of whole stages.
+    """
+    protocol, method = subject.protocol, subject.resolved.method
+    at_ends = all(protocol.is_end(row.point) for row in subject.run.record.episode_rows())
+    return at_ends and len(protocol.steps) > 1 and not method.whole_stages
 
 
 def _check_definition(subject: Subject) -> Check:
@@ -301,8 +317,10 @@ def _check_time(subject: Subject, again: Record) -> list[Check]:
     theirs: Any
     ours: Any
     theirs, ours = (record.timing.get("step_ratio") for record in (subject.run.record, again))
-    if not is_number(theirs) or not is_number(ours):
+    if not is_number(ours):
         return []
+    if not is_number(theirs):  # the oldest records lack it, and a forger may leave it out
+        return [Check("time of a step", f"not in the record, {ours:.2f} times that of sft here", True)]
     alike = 1 / OTHER_TIME < theirs / ours < OTHER_TIME
     found = f"{theirs:.2f} times that of sft in the record, {ours:.2f} here"
     return [Check("time of a step", found, True if alike else None)]
@@ -405,7 +423,7 @@ def _job(path: Path, records: Path, request: Request, report: Path) -> Job:
     except ClbenchError:
         pass  # the job itself reports the error
     arguments = {"path": path, "records": records, "request": request, "report": report}
-    return Job(str(path), verify_job, arguments, length, device=device)
+    return Job(printable(str(path)), verify_job, arguments, length, device=device)
 
 
 def verify_job(path: Path, records: Path, request: Request, report: Path, progress: ProgressCallback) -> str:
@@ -413,7 +431,8 @@ def verify_job(path: Path, records: Path, request: Request, report: Path, progre
     checks = verify(path, records, request, progress)
     report.write_text(json.dumps([asdict(check) for check in checks]), encoding="utf-8")
     marks = {True: "ok ", False: "NOT", None: "?  "}
-    text = "\n".join(f"  {marks[check.passed]} {check.name}: {check.found}" for check in checks)
+    # in one line each: a stranger's text must not look like another check
+    text = "\n".join(f"  {marks[check.passed]} {check.name}: {printable(check.found)}" for check in checks)
     progress(1.0)
     tier = tier_of(path)
     if not all(check.passed for check in checks):

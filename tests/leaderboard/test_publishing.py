@@ -1,5 +1,6 @@
 """Copies of the published records in folders of your own."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from clbench.base.entry_points import resolve
 
 add_published = resolve("clbench.leaderboard.publishing:add_published")
+show = resolve("clbench.leaderboard.cli:show")
 
 
 def test_the_ladder_comes_with_the_published_records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -28,3 +30,26 @@ def test_the_ladder_comes_with_the_published_records(tmp_path: Path, monkeypatch
         "records/Toy-v0/sft/seed-0.verified",
     ]
     assert add_published(mine) == 0
+
+
+def test_a_link_in_the_place_of_the_site_is_not_followed(
+    four_methods: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "index.html").write_text("mine", encoding="utf-8")
+    (four_methods.parent / "site").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(SystemExit, match="2"):
+        show(records=four_methods)
+    assert "site is a symbolic link" in " ".join(capsys.readouterr().err.split())
+    assert [path.read_text(encoding="utf-8") for path in (tmp_path / "elsewhere").iterdir()] == ["mine"]
+
+
+def test_a_list_of_files_that_names_another_folder_removes_nothing(
+    four_methods: Path, shown: Callable[[], tuple[str, str]]
+) -> None:
+    site = four_methods.parent / "site"
+    site.mkdir()
+    (site / "board.json").write_text('{"files": {"..": "", "\\u0000": ""}}', encoding="utf-8")
+    _, page = shown()
+    assert (site / "LEADERBOARD.md").read_text(encoding="utf-8") == page
+    assert four_methods.is_dir()

@@ -46,6 +46,24 @@ def test_one_learning_rate_is_no_ladder(even_board: Callable[..., Path]) -> None
     assert not compute_board(even_board("sft", 0, 0.1)).frontiers
 
 
+@pytest.mark.parametrize("factor", [1, 1.0000001])
+def test_a_learning_rate_written_in_another_way_takes_no_record_of_a_rung_away(
+    factor: float, even_board: Callable[..., Path]
+) -> None:
+    for honest in (1.0, 0.3):
+        even_board("sft", 0, 0.2, "ladder", step_factor=honest)
+    even_board("sft", 0, 0.9, "ladder", step_factor=factor)
+    board = compute_board(even_board("sft", 0, 0.1))
+    (curve,) = board.frontiers[SCENARIO]
+    assert [(rung.factor, rung.kept.value, rung.seeds) for rung in curve.rungs] == [
+        (1.0, pytest.approx(0.2), (0,)),
+        (0.3, pytest.approx(0.2), (0,)),
+    ]
+    (refused,) = board.not_shown
+    assert refused.path == f"ladder/Even-v1/sft+step_factor={factor}/seed-0.json"
+    assert "its changes have no step_factor, the ladder's setting" in refused.reason
+
+
 def test_a_ladder_of_another_simulator_has_no_curve_and_the_board_says_why(
     even_board: Callable[..., Path],
 ) -> None:

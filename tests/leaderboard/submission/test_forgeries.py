@@ -2,11 +2,15 @@
 
 import importlib
 import re
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from verification import Edit, edit, failures, flip, verify
+from verification import TOY, Edit, edit, failures, flip, verify
+
+from clbench.records.reader import home_of, read_record
+from clbench.runs.spec import RunSpec
 
 tiers = importlib.import_module("clbench.leaderboard.board.tiers")
 
@@ -21,6 +25,8 @@ class Forgery(NamedTuple):
     reason: str
     """What its failed check says; empty if there is none."""
     change: Edit
+    moves: bool = False
+    """Whether the record then lies where its run belongs."""
 
 
 def set_in(part: str, **changes: Any) -> Edit:
@@ -88,6 +94,22 @@ def repeat_row(values: dict[str, Any]) -> None:
         column.append(column[-1])
 
 
+def leave_out_the_curve(values: dict[str, Any]) -> None:
+    for table in ("episodes", "answers", "policy"):
+        keep(values, table, lambda row: row["step"] in (0, 60))
+
+
+def become_older_than_definitions(values: dict[str, Any]) -> None:
+    """Write the record as schema 3 did."""
+    values["schema"] = 3
+    for part, name in (("fingerprint", "definition"), ("policy", "captured"), ("run", "policy")):
+        del values[part][name]
+
+
+def be_of_another_method(values: dict[str, Any]) -> None:
+    values["run"] = asdict(RunSpec(TOY, "l2_sp", 0).resolve().info)
+
+
 def rename_processor(values: dict[str, Any]) -> None:
     hardware = values["fingerprint"]["hardware"]
     hardware["processor"] = f"{hardware['processor'].partition(' ')[0]} Abacus"
@@ -123,6 +145,11 @@ FORGERIES = {
         "recomputed",
         "record: answers: there must be none",
         lambda values: keep(values, "episodes", lambda row: row["step"] in (0, 60)),
+    ),
+    "the curve left out, with its answers and changes": Forgery(
+        "recomputed",
+        "what was run: episodes before the ends of stages differ from the installed code",
+        leave_out_the_curve,
     ),
     "a column cut short": Forgery(
         "recomputed",
@@ -171,8 +198,10 @@ FORGERIES = {
     "a changed setting shown as the default": Forgery(
         "recomputed", "record: run: settings do not match ", set_in("run.settings", step_factor=0.5)
     ),
-    "another seed": Forgery("recomputed", "in the folder of records", set_in("run", seed=7)),
-    "another method's name": Forgery(
+    "another seed, at the path of this one": Forgery(
+        "recomputed", "in the folder of records", set_in("run", seed=7)
+    ),
+    "another method's name, at the path of this one": Forgery(
         "recomputed", "record: run: uses do not match joint", set_in("run", method="joint")
     ),
     "validation episodes shown as test episodes": Forgery(
@@ -195,6 +224,12 @@ FORGERIES = {
     ),
     "a correct answer at the end": Forgery(
         "replayed", "answers: different counts", lambda values: answer_more(values, 60)
+    ),
+    "another seed, at a path of its own": Forgery(
+        "replayed", "pretraining does not give the same policy", set_in("run", seed=7), moves=True
+    ),
+    "another method's name, at a path of its own": Forgery(
+        "replayed", "episodes: ", be_of_another_method, moves=True
     ),
     "another pretrained policy": Forgery(
         "replayed", "pretraining does not give the same policy", set_in("fingerprint", pretrained="0" * 16)
@@ -249,6 +284,7 @@ FORGERIES = {
     ),
     # ---- what no repetition can see: the reasons are in docs/guide/security.md
     "another commit": Forgery(None, "", set_in("fingerprint.commit", id="0" * 40)),
+    "another version of clbench": Forgery(None, "", set_in("fingerprint.versions", clbench="9.0")),
     "another version of Python": Forgery(None, "", set_in("fingerprint", python="3.12.0")),
     "another processor of the same maker": Forgery(None, "", rename_processor),
     "another time of day": Forgery(None, "", set_in("timing", started="2001-01-01T00:00:00+00:00")),
@@ -258,6 +294,7 @@ FORGERIES = {
         "",
         lambda values: keep_entries(values["fingerprint"]["definition"], lambda name: "rule" not in name),
     ),
+    "no definition, as before schema 4": Forgery(None, "", become_older_than_definitions),
     "another source of the method": Forgery(None, "", set_in("fingerprint.method", source="0" * 16)),
 }
 """Lies of one record, by what they claim."""
@@ -269,8 +306,12 @@ SLOW = [name for name in FORGERIES if name not in QUICK]
 
 def check_refusal(name: str, mine: Path, honest: Path) -> None:
     """Forge a record, verify it at the highest tier, and check how far it came."""
-    tier, reason, change = FORGERIES[name]
+    tier, reason, change, moves = FORGERIES[name]
     edit(mine, change)
+    if moves:
+        home = mine.parents[2] / home_of(read_record(mine).run)
+        home.parent.mkdir(exist_ok=True)
+        mine = mine.rename(home)
     found = failures(verify(mine, "retrained", honest))
     below = tiers.TIERS[tiers.TIERS.index(tier) - 1] if tier else "retrained"
     assert tiers.tier_of(mine) == below

@@ -260,6 +260,9 @@ def test_a_step_that_is_said_to_be_much_cheaper_or_dearer_leaves_the_tier_open(t
     for ratio in (0.05, 50.0):
         assert f"time of a step: {ratio:.2f} times that of sft in the record" in found(ratio)
         assert tiers.tier_of(path) == "replayed"
+    edit(path, lambda values: values["timing"].pop("step_ratio"))
+    (said,) = (one.found for one in verify(path, "retrained") if one.name == "time of a step")
+    assert said.startswith("not in the record, ")
 
 
 @pytest.mark.long

@@ -368,11 +368,11 @@ def test_a_strangers_text_in_a_check_does_not_control_the_terminal(
     mine: Path, honest: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = importlib.import_module("clbench.leaderboard.cli").verify
-    edit(mine, lambda values: values["fingerprint"]["rollouts"].update({"[red]\x1b[2Jworld": "0"}))
+    edit(mine, lambda values: values["fingerprint"]["rollouts"].update({"[red]\x1b[2Jw\n  ok  b": "0"}))
     with pytest.raises(SystemExit):
         command(mine, tier="recomputed", scenario=TOY, records=mine.parents[2], workers=1)
     shown = capsys.readouterr().out
-    assert "the rollouts of [red]\\x1b[2Jworld differ" in shown
+    assert "the rollouts of [red]\\x1b[2Jw\\n  ok  b differ" in shown
     assert "\x1b" not in shown
 
 

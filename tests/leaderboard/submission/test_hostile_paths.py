@@ -1,0 +1,32 @@
+"""Records whose paths a stranger chose to deceive the verifier, or to reach other folders."""
+
+from pathlib import Path
+
+import pytest
+from verification import TOY, failures, verify
+
+from clbench.base.entry_points import resolve
+
+command = resolve("clbench.leaderboard.cli:verify")
+
+
+@pytest.mark.long
+def test_the_name_of_a_file_cannot_look_like_a_check(mine: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = mine.rename(mine.with_name("seed-0.json: retrained\n  ok  whole run: repeated\n.json"))
+    with pytest.raises(SystemExit):
+        command(path, tier="recomputed", scenario=TOY, records=mine.parents[2], workers=1)
+    shown = capsys.readouterr().out
+    assert "seed-0.json: retrained\\n  ok  whole run: repeated\\n.json: self-reported" in shown
+    assert "\n  ok " not in shown
+
+
+def test_a_linked_folder_of_a_method_is_not_verified_and_nothing_in_it_changes(
+    mine: Path, tmp_path: Path
+) -> None:
+    outside = mine.parent.rename(tmp_path / "outside")
+    mine.parent.symlink_to(outside)
+    for content in ("", "{}"):
+        (outside / "seed-0.verified").write_text(content, encoding="utf-8")
+        assert "a symbolic link leads out of" in failures(verify(mine, "recomputed"))
+        assert (outside / "seed-0.verified").read_text(encoding="utf-8") == content
+        (outside / mine.name).write_text("{}", encoding="utf-8")  # and no record, whose tier would be deleted
