@@ -60,7 +60,7 @@ def deviation_of_differences(metric: str, rows: Iterable[Runs]) -> float | None:
 def least_difference(deviation: float, rows: int, seeds: int) -> float:
     """Return the difference beyond which Tukey's test tells two of several equally noisy rows apart.
 
-    A true difference of this size shows in about half of the boards.
+    A true difference of this size shows in somewhat less than half of the boards.
 
     Args:
         deviation: Standard deviation of the difference of two rows, see `deviation_of_differences`.
@@ -109,7 +109,7 @@ def groups(metric: str, rows: Mapping[str, Runs]) -> dict[str, str]:
        rows may vary more than others;
     3. from the episodes: the jackknife over them, since all rows may agree by chance.
 
-    About 5 % of the boards of equal methods thus have more than one group, and up to 9 % where one method
+    About 5 % of the boards of equal methods thus have more than one group, and up to 12 % where one method
     varies far more than the others: `docs/guide/statistics.md` has the figures. Rows without a common seed
     are compared by the variation of runs around the mean of their row, and so are all rows if no two have
     two common seeds. Where no row has a second seed, a deviation of `UNKNOWN_DEVIATION` is assumed: only

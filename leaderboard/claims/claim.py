@@ -219,8 +219,11 @@ def _seeds_for(figure: Figure, bar: float) -> int | None:
 def _reach(figure: Figure, end: float) -> float:
     """Return what the quantile times the error is proportional to if the interval has this end.
 
-    It is the distance; between two bounds, as in `interval_of_seeds`, the error is smaller near a bound.
+    It is the distance, of a ratio that of the logarithms; between two bounds, as in `interval_of_seeds`, the
+    error is smaller near a bound.
     """
+    if figure.ratio and figure.low > 0:
+        return abs(math.log(figure.value / end))
     low, high = figure.span
     room = (end - low) * (high - end)
     return abs(figure.value - end) / (math.sqrt(room) if 0 < room < math.inf else 1.0)

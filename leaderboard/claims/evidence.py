@@ -63,6 +63,8 @@ class Figure:
     """Format of the number."""
     span: Span = UNBOUNDED
     """Least and greatest possible value."""
+    ratio: bool = False
+    """Whether it is a positive ratio, whose interval is that of its logarithm."""
 
     @property
     def value(self) -> float:
@@ -147,7 +149,7 @@ class Evidence:
                 note = "not measured in these records"
             elif len(common) < LEAST_SEEDS:
                 note = "one seed: the interval does not cover other seeds and decides nothing"
-        return Figure(what, methods, found, common, missing, note, form, span)
+        return Figure(what, methods, found, common, missing, note, form, span, ratio)
 
     def _scores(self, methods: Iterable[str], seeds: Iterable[int]) -> dict[str, list[Scores]]:
         return {label: [self.runs[label][seed].scores for seed in seeds] for label in methods}
@@ -270,7 +272,8 @@ class Evidence:
             missing = tuple(label for label in methods if not self.runs.get(label))
             note = "" if missing else "not in these records"
             return Figure(what, methods, NO_ESTIMATE, seeds, missing, note, form)
-        return Figure(what, methods, mean_of_seeds(values, span, ratio=ratio), seeds, (), "", form, span)
+        found = mean_of_seeds(values, span, ratio=ratio)
+        return Figure(what, methods, found, seeds, (), "", form, span, ratio)
 
     def step_time(self, method: str) -> Figure:
         """Return the time of a step of the method, divided by sft's."""

@@ -240,6 +240,17 @@ def test_the_seeds_that_would_decide_a_share_near_0_are_those_of_its_own_interva
     assert f"At this spread, about {needed} seeds would be needed: " in what_would_change(figure, 0.01)
 
 
+def test_the_seeds_that_would_decide_a_ratio_are_those_of_the_interval_of_its_logarithm(bench: Bench) -> None:
+    ratios = (1.0, 1.5, 2.5, 6.0)
+    bench.add("aegis", seeds=4, edit=lambda record: record.timing.update(step_ratio=ratios[record.run.seed]))
+    figure = bench.evidence().step_time("aegis")
+    assert figure.low < 1.2 < figure.value
+    mean, deviation = np.mean(np.log(ratios)), np.std(np.log(ratios), ddof=1)
+    lows = {n: mean - stats.t.ppf(0.975, n - 1) * deviation / n**0.5 for n in range(4, 101)}
+    needed = next(n for n, low in lows.items() if low >= np.log(1.2))
+    assert f"At this spread, about {needed} seeds would be needed: " in what_would_change(figure, 1.2)
+
+
 def test_a_run_in_another_order_of_the_targets_is_no_evidence(bench: Bench, add: Callable[..., None]) -> None:
     for seed in range(2):
         add("sft", seed, [[1, 1, 0, 0, 0], [1, 1, 1, 0, 0], [0.5, 0.5, 1, 1, 0]])
