@@ -126,6 +126,8 @@ def tune(
         return
     chosen = _choose(classes, ladder, run)
     Console().print(_table(table, {name: (one.settings, one.tried) for name, one in chosen.items()}, seeds))
+    for name, one in chosen.items():
+        print_plain(Console(), _choice(name, one))
     if write is not None:
         _write(write, table, numbers, chosen)
     if len(chosen) < len(names):
@@ -293,6 +295,19 @@ def _table(name: str, found: Mapping[str, tuple[Settings | None, Sequence[Tried]
             values = ["failed" if score is None else format(score, form) for score, form in scores]
             table.add_row(method, _words(tried.settings), *values, style=style)
     return table
+
+
+def _choice(method: str, tuned: Tuned) -> str:
+    """Return the chosen settings in words, which a file shows, too, and whether they learn too little."""
+    from clbench.runs.tuning import LEARNED
+
+    text = f"{method}: {_words(tuned.settings)} is chosen."
+    if any((one.learned or 0.0) >= LEARNED for one in tuned.tried):
+        return text
+    return (
+        f"{text} No setting has learned {LEARNED}, so this is the first that learns most: give the budget "
+        "of the scenario more adaptation_steps or another learning_rate, and tune again."
+    )
 
 
 def _words(settings: Mapping[str, Any]) -> str:

@@ -30,7 +30,7 @@ from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 from clbench.testing.global_state import same
-from clbench.worlds.lanes import Lanes
+from clbench.worlds.lanes import Lanes, success_at_horizon
 from clbench.worlds.observation import Observer
 from clbench.worlds.world import World
 
@@ -48,9 +48,10 @@ def check_scenario(scenario: Scenario | str, *, episodes: int = 10, success: flo
     Worlds: all have spaces of numbers, of one size in the whole scenario, and actions from -1 to 1.
 
     Tasks: no two have an instruction in common; the expert succeeds often enough; doing nothing fails at
-    least once; `terminated` and `info["success"]` both mean success and nothing else; observations are in
-    their space and rewards are numbers; the initial state depends on the seed; an episode depends only on the
-    seed and the actions, also after other episodes, in a new world, and side by side in a vector world.
+    least once; `terminated` and `info["success"]` both mean success and nothing else, and come only at the
+    horizon if the world declares `success_at_horizon`; observations are in their space and rewards are
+    finite numbers; the initial state depends on the seed; an episode depends only on the seed and the
+    actions, also after other episodes, in a new world, and side by side in a vector world.
 
     Cameras: each draws a first state, which needs a machine that can draw.
 
@@ -154,6 +155,12 @@ def _check_task(task: Task, world: World, episodes: int, success: float) -> None
     expert = _aimless(world) if recorded else resolve(task.expert)(task.name)
     seeds = [derive_seed("check", task.name, number) for number in range(episodes)]
     played = [_play(task, world, seed, expert) for seed in seeds]
+    early = [len(episode.successes) for episode in played if episode.successes[: task.horizon - 1].any()]
+    if early and success_at_horizon(task):
+        raise ScenarioError(
+            f"task {task.name}: {task.world} declares success_at_horizon, but an episode succeeds after "
+            f"{early[0]} of {task.horizon} steps: environments would call it truncated, not terminated."
+        )
     share = sum(episode.successes.any() for episode in played) / episodes
     if share < success and not recorded:
         raise ScenarioError(
@@ -203,7 +210,11 @@ def _play(task: Task, world: World, seed: int, act: Any) -> _Episode:
     states, actions, rewards, successes, done = [state], [], [], [], False
     for step in range(task.horizon + 1):
         where = f"task {task.name}, step {step}"
-        if not world.observation_space.contains(state) or not np.isfinite(state).all():
+        if (
+            not isinstance(state, np.ndarray)  # Gymnasium would take a list for an array
+            or not world.observation_space.contains(state)
+            or not np.isfinite(state).all()
+        ):
             kind = f"{getattr(state, 'dtype', type(state).__name__)} of shape {np.shape(state)}"
             raise ScenarioError(
                 f"{where}: the state is not in {world.observation_space}, or not finite: it is {kind}."
@@ -226,8 +237,9 @@ def _play(task: Task, world: World, seed: int, act: Any) -> _Episode:
                 f"{where}: the world changed its last state in place and returned it: return a copy."
             )
         states.append(state)
-        if not np.isfinite(float(reward)):
-            raise ScenarioError(f"{where}: the reward is {reward}.")
+        number = np.asarray(reward, np.float64)  # None becomes NaN
+        if number.ndim or not np.isfinite(number):
+            raise ScenarioError(f"{where}: the reward is {reward}, but must be a finite number.")
         rewards.append(float(reward))
         successes.append(bool(done))
     return _Episode(np.array(states), np.array(actions), np.array(rewards), np.array(successes))
@@ -257,6 +269,8 @@ def _check_side_by_side(task: Task, seeds: list[int], alone: list[_Episode]) -> 
 
 def _check_questions(scenario: Scenario, episodes: int) -> None:
     kinds: tuple[QuestionKind, ...] = resolve(scenario.questions)
+    if not isinstance(kinds, tuple) or not all(isinstance(kind, QuestionKind) for kind in kinds):
+        raise ScenarioError(f"{scenario.questions} must be a tuple of QuestionKinds, not {kinds!r}.")
     if len({kind.name for kind in kinds}) != len(kinds) or not kinds:
         raise ScenarioError(f"{scenario.questions}: there must be questions, each kind with its own name.")
     scenes = np.concatenate(list(_scenes(scenario, episodes)))

@@ -152,11 +152,14 @@ def scenario_card(
                 print_plain(console, f"The card of {name} stays as it is. {error.args[0]}")
                 continue
             typed[scenario.id], homes[output / folder_name(scenario.id)] = name, scenario
-    fault = choose_renderer([task for home, scenario in homes.items() for task in undrawn(scenario, home)])
-    if fault is not None:
-        print_plain(console, f"No pictures are drawn; existing ones are kept unless outdated. {fault}")
+    # before any world is made; a world that cannot be drawn takes no picture from another scenario
+    faults = {home: choose_renderer(undrawn(scenario, home)) for home, scenario in homes.items()}
     for home, scenario in homes.items():
-        experts = make_missing(scenario, home, episodes, drawing=fault is None, console=console)
+        if (fault := faults[home]) is not None:
+            kept = "No pictures are drawn; existing ones are kept unless outdated."
+            print_plain(console, f"{scenario.id}: {kept} {fault}")
+        with checked_input():  # an expert may refuse its task
+            experts = make_missing(scenario, home, episodes, drawing=fault is None, console=console)
         drawn = {task.name for task in scenario.tasks if picture_path(home, task).is_file()}
         card = Card(scenario, board, experts, frozenset(drawn), typed[scenario.id], records)
         _write({output / f"{home.name}.md": card.page()})

@@ -146,7 +146,10 @@ class Card:
                 for task in self.scenario.tasks
                 if task.name in self.pictures
             },
-            without_picture=[task.name for task in self.scenario.tasks if task.name not in self.pictures],
+            without_picture=[name for name in self.experts.successes if name not in self.pictures],
+            without_expert=[
+                task.name for task in self.scenario.tasks if task.name not in self.experts.successes
+            ],
             spaces=spaces_of(self.scenario),
             budget=[(name, meanings[name], value) for name, value in values.items()],
             questions=resolve(self.scenario.questions),

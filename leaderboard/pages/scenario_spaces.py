@@ -58,7 +58,7 @@ def spaces_of(scenario: Scenario) -> Spaces:
     if first.camera is not None:  # a policy sees what the camera passes on, and not the state of the world
         words.append(_second_paragraph(resolve(first.camera)))
     elif (name := _state_module(described.__module__)) is not None:
-        text, parts = _layout(name)
+        text, parts = _layout(name, config.state_size)
         words.append(text)
     return Spaces(
         state_size=config.state_size,
@@ -85,22 +85,28 @@ def _state_module(world: str) -> str | None:
     return name if package and importlib.util.find_spec(name) is not None else None
 
 
-def _layout(name: str) -> tuple[str, tuple[tuple[str, str], ...]]:
-    """Return the first two paragraphs about a state, and its documented slices in their order."""
+def _layout(name: str, size: int) -> tuple[str, tuple[tuple[str, str], ...]]:
+    """Return the first two paragraphs about a state of `size` numbers, and its documented slices in order.
+
+    Both are empty if a slice goes beyond the state.
+    """
     module = importlib.import_module(name)
     tree = ast.parse(inspect.getsource(module))
     first, *rest = (ast.get_docstring(tree) or "").split("\n\n")
     text = " ".join(" ".join([first, *rest[:1]]).split())
-    found: list[tuple[slice, str]] = []
+    found: list[tuple[range, str]] = []
     for one, after in zip(tree.body, tree.body[1:], strict=False):
         match one, after:
             case ast.Assign(targets=[ast.Name(id=constant)]), ast.Expr(
                 value=ast.Constant(value=str(meaning))
             ):
                 place = getattr(module, constant)
-                if isinstance(place, slice):
-                    found.append((place, " ".join(meaning.split())))
+                if isinstance(place, slice):  # whose ends may be open or counted from the end
+                    if (place.stop or 0) > size:  # the module is about the states of another world
+                        return "", ()
+                    found.append((range(size)[place], " ".join(meaning.split())))
     return text, tuple(
-        (f"{place.start} to {place.stop - 1}", meaning)
+        (f"{place[0]} to {place[-1]}", meaning)
         for place, meaning in sorted(found, key=lambda pair: pair[0].start)
+        if place
     )

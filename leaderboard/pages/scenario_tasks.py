@@ -20,6 +20,7 @@ from clbench.base.seeding import derive_seed
 from clbench.base.text import counted
 from clbench.data.demonstrations import demonstrate
 from clbench.data.expert_rates import measure
+from clbench.evaluation.definition import recording_of
 from clbench.jobs.bars import Bars
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
@@ -45,7 +46,7 @@ class Experts:
     episodes: int
     """Number of episodes of each task."""
     successes: Mapping[str, int]
-    """Number of successes by task."""
+    """Number of successes by task; a task that learns from a recording has no expert."""
 
 
 def picture_path(folder: Path, task: Task) -> Path:
@@ -91,11 +92,10 @@ def make_missing(
         console: Console that shows the progress.
     """
     kept, missing = _read(folder), undrawn(scenario, folder)
-    bare = missing if drawing else []
-    asked = {task.name: {"version": task.version, "episodes": episodes} for task in scenario.tasks}
-    stale = [
-        task for task in scenario.tasks if not asked[task.name].items() <= kept.get(task.name, {}).items()
-    ]
+    tasks = [task for task in scenario.tasks if recording_of(task) is None]
+    bare = [task for task in tasks if task in missing] if drawing else []
+    asked = {task.name: {"version": task.version, "episodes": episodes} for task in tasks}
+    stale = [task for task in tasks if not asked[task.name].items() <= kept.get(task.name, {}).items()]
     folder.mkdir(parents=True, exist_ok=True)
     with Bars(len(stale) * episodes + len(bare), console) as bars:
         bars.start(scenario.id, len(stale) * episodes + len(bare))
@@ -106,10 +106,10 @@ def make_missing(
             scenario.id, f"{counted(len(stale), 'expert')} measured, {counted(len(bare), 'picture')} drawn"
         )
     # A picture of a former version would count as one of the version that the file names from now on.
-    current = {picture_path(folder, task) for task in scenario.tasks if task in bare or task not in missing}
+    current = {picture_path(folder, task) for task in tasks if task in bare or task not in missing}
     for path in {*folder.glob("*.webp")} - current:
         path.unlink()
-    found = {task.name: kept[task.name] for task in scenario.tasks}
+    found = {task.name: kept[task.name] for task in tasks}
     lines = (f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in found.items())
     write_all({folder / EXPERTS: "{\n" + ",\n".join(lines) + "\n}\n"})
     return Experts(episodes, {name: entry["successes"] for name, entry in found.items()})

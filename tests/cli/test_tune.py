@@ -85,7 +85,7 @@ def test_runs_of_fewer_targets_leave_the_records_of_all_targets(tune: Tune, tmp_
 
 @pytest.mark.long
 def test_tune_writes_the_best_of_six_settings(tune: Tune, tmp_path: Path) -> None:
-    _, err = tune("--write", "tuned/Tiny-v0.json")
+    out, err = tune("--write", "tuned/Tiny-v0.json")
     file = json.loads((tmp_path / "tuned" / "Tiny-v0.json").read_text())
     assert (file["scenario"], file["seeds"]) == ("me/Tiny-v0", [103])
     found = file["methods"]["l2_sp"]
@@ -93,6 +93,9 @@ def test_tune_writes_the_best_of_six_settings(tune: Tune, tmp_path: Path) -> Non
     assert [one["step_factor"] for one in tried[:4]] == [1.0, 0.3, 0.1, 0.03]
     assert [one["strength"] for one in tried] == [0.3, 0.3, 0.3, 0.3, 0.1, 1.0]
     assert found["settings"] in tried
+    chosen = " ".join(f"{name}={value}" for name, value in found["settings"].items())
+    assert f"l2_sp: {chosen} is chosen. No setting has learned 0.8, so" in out  # bold is lost in a file
+    assert all(one["learned"] < 0.8 for one in found["tried"])
     assert "6 of 6 runs" not in err  # four, then two
 
 

@@ -98,6 +98,28 @@ class Lost(ToyWorld):
         return state, float("nan"), *rest
 
 
+class Unpaid(ToyWorld):
+    """It gives no rewards."""
+
+    def step(self, action: Any) -> Any:
+        state, _, *rest = super().step(action)
+        return state, None, *rest
+
+
+class Listing(ToyWorld):
+    """Its states are lists."""
+
+    def reset(self, **options: Any) -> Any:
+        state, info = super().reset(**options)
+        return state.tolist(), info
+
+
+class Hasty(ToyWorld):
+    """It says that it judges success only at the horizon, but succeeds before."""
+
+    success_at_horizon = True
+
+
 class Limited(ToyWorld):
     """It ends its episodes by itself, after three steps."""
 
@@ -209,6 +231,7 @@ def fractions(states: Any) -> Any:
 
 
 NO_QUESTIONS: tuple[QuestionKind, ...] = ()
+NO_TUPLE = TOY_QUESTIONS[0]
 TWICE = TOY_QUESTIONS[:1] * 2
 ONE_ANSWER = (dataclasses.replace(TOY_QUESTIONS[0], answers=("left",)),)
 LONG_ANSWER = (dataclasses.replace(TOY_QUESTIONS[0], answers=("left", "to the right")),)
@@ -250,6 +273,9 @@ def test_the_toy_passes() -> None:
         ("Mute", r'terminated is True, info\["success"\] is None'),
         ("Giving", "doing nothing completes it"),
         ("Lost", "step 0: the reward is nan"),
+        ("Unpaid", "step 0: the reward is None, but must be a finite number"),
+        ("Listing", r"step 0: the state is not in .*: it is list of shape \(4,\)"),
+        ("Hasty", r"Hasty declares success_at_horizon, but an episode succeeds after \d+ of 12 steps"),
         ("Limited", "step 2: the world truncates, but only the task's horizon may do so"),
         ("Strong", "actions must go from -1 to 1"),
         ("Framed", "observation space must be a Box of one axis"),
@@ -292,6 +318,7 @@ def test_the_expert_of_a_background_task_is_checked_too() -> None:
     ("questions", "message"),
     [
         ("NO_QUESTIONS", "there must be questions"),
+        ("NO_TUPLE", r":NO_TUPLE must be a tuple of QuestionKinds, not QuestionKind\(name='side'"),
         ("TWICE", "each kind with its own name"),
         ("ONE_ANSWER", "must have two answers or more"),
         ("LONG_ANSWER", "The word 'to the right' is not in the vocabulary"),

@@ -277,7 +277,7 @@ def test_where_nothing_draws_the_card_says_so_and_keeps_the_pictures_that_are_th
     lost.unlink()
     monkeypatch.setattr("clbench.worlds.gl_backend.rendering_fault", lambda *_: "no display")
     card = bench.card()
-    assert "Without a picture: left. No renderer worked where this card was made." in card
+    assert "Without a picture: left. No renderer drew them where this card was made." in card
     assert "| left | - | go left" in card
     assert "![up](Toy-v0/up.webp)" in card
     assert kept.read_bytes() == before
