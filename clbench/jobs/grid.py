@@ -19,7 +19,7 @@ from clbench.jobs.bars import lines_console
 from clbench.jobs.folders import check_folders
 from clbench.jobs.job import Job, Workers
 from clbench.jobs.processes import Here, Processes
-from clbench.jobs.recorded import has_record, set_aside
+from clbench.jobs.recorded import has_record, is_of_other_code, set_aside
 from clbench.jobs.scheduler import run_with_bars
 from clbench.records.paths import RECORDS
 from clbench.records.reader import read_record
@@ -128,7 +128,7 @@ def run_missing(
         return failed
     minutes = (time.monotonic() - begin) / 60
     run_jobs = [job for job in plan.jobs if job.function is do_run]
-    for job, reason in _without_record(run_jobs, failed, records).items():
+    for job, reason in _without_record(run_jobs, to_do.runs, failed, records).items():
         _print(console, f"{job}: {reason}")
         failed[job] = reason
     _print(console, f"{_done(to_do, failed)} in {minutes:.1f} minutes; records in {records}.")
@@ -170,14 +170,22 @@ def _part(lost: int, count: int) -> str:
     return f"{count - lost} of " if lost else ""
 
 
-def _without_record(jobs: Sequence[Job], failed: Mapping[Job, str], records: Path) -> dict[Job, str]:
+def _without_record(
+    jobs: Sequence[Job], runs: Iterable[ResolvedRun], failed: Mapping[Job, str], records: Path
+) -> dict[Job, str]:
     """Return the jobs that reported success but left no record that counts, each with the reason."""
-    lost = {}
+    lost, by_path = {}, {run.path(records.absolute()): run for run in runs}
     for job in jobs:
         if job.product is None or job in failed or job.product.exists():
             continue
         path = records / job.product.path.relative_to(records.absolute())
-        lost[job] = f"it ended without a record of this run at {path}."
+        run = by_path[job.product.path]
+        lost[job] = (
+            f"{path} has other code or settings of {run.spec.method} than this command began with: its "
+            "module was edited meanwhile. Repeat the command; in a notebook, restart the kernel first."
+            if is_of_other_code(run, path)
+            else f"it ended without a record of this run at {path}."
+        )
     return lost
 
 

@@ -74,6 +74,16 @@ def has_failed(run: ResolvedRun, records: Path) -> bool:
     return record.status == "failed" and is_of(record, run, path)
 
 
+def is_of_other_code(run: ResolvedRun, path: Path) -> bool:
+    """Return whether the record at `path`, which a run just wrote, has other code or defaults than `run`."""
+    try:
+        record = read_record(path)
+    except RecordError:
+        return False
+    edited = changed_code(record, run) or not has_settings_of(record, run)
+    return record.status == "success" and ":" in run.spec.method and bool(edited)
+
+
 def set_aside(run: ResolvedRun, records: Path) -> str | None:
     """Rename the record of a run if it is damaged, or from older code or weights, to repeat the run.
 

@@ -93,7 +93,8 @@ class RunSpec:
         check_abilities(kind_of(self.policy), method.needs, self.method)
         changes = read_changes(self.method, method, self.changes)
         run = ResolvedRun(self, scenario, published, method, changes)
-        _settings_of(run.new_method())  # refuses a setting that no record can hold, before any work
+        # refuses a field without a default, or that no record can hold, before any work
+        _ = run.defaults, _settings_of(run.new_method())
         return run
 
     def scenarios(self) -> tuple[Scenario, Scenario]:
@@ -155,7 +156,9 @@ class ResolvedRun:
     @cached_property
     def defaults(self) -> Mapping[str, Any]:
         """The method's default hyper-parameters, neither tuned nor changed, as a record holds them."""
-        return _settings_of(self.method())
+        from clbench.learning.registry import new_method
+
+        return _settings_of(new_method(self.spec.method, self.method, {}))
 
     @cached_property
     def info(self) -> RunInfo:

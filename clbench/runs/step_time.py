@@ -18,6 +18,7 @@ import torch
 
 from clbench.learning.adaptation import Step
 from clbench.learning.method import Method
+from clbench.learning.optimise import steps_counted
 from clbench.learning.registry import load_method
 from clbench.learning.trainer import Trainer
 from clbench.spec.references import BASELINE
@@ -58,15 +59,23 @@ def _copy(trainer: Trainer, new_method: Callable[[], Method]) -> Trainer:
 
 
 def _seconds(trainer: Trainer, number: int) -> float | None:
-    """Return the seconds that a block of steps takes, without the first step, which makes the optimiser."""
-    marks: list[float] = []
+    """Return the seconds of an optimiser step in a block, without the first step, which makes the optimiser.
+
+    If the method has an optimiser of its own, several optimisers share the time of a step of the loop: the
+    costs count the steps of all.
+    """
+    marks: list[tuple[float, int]] = []
 
     def after(step: Step) -> bool:
         if step.loss is not None:
             if trainer.device.type == "cuda":
                 torch.cuda.synchronize(trainer.device)
-            marks.append(time.perf_counter())
+            marks.append((time.perf_counter(), taken()))
         return len(marks) > STEPS
 
-    trainer.learn(number, after)
-    return marks[-1] - marks[0] if len(marks) > STEPS else None
+    with steps_counted() as taken:
+        trainer.learn(number, after)
+    if len(marks) <= STEPS:
+        return None
+    seconds, steps = (last - first for first, last in zip(marks[0], marks[-1], strict=True))
+    return seconds / steps

@@ -172,6 +172,30 @@ def test_runs_that_failed_are_not_counted_and_neither_are_the_jobs_that_they_sha
     assert re.match(r"0 of 2 runs in \d+\.\d minutes; records in ", last)
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("first", ["edit", "run"])
+def test_a_method_that_is_edited_before_its_run_begins_or_ends_is_named(
+    first: str, tmp_path: Path, write_module: Callable[[str, str], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(sys.modules, "edited", raising=False)
+    write_module("edited", METHOD)
+    run = RunSpec(TINY, "edited:Slow", 0).resolve()
+
+    def edit_and_run(*_: Any) -> dict[Job, str]:
+        """Do the run as another process would, which imports the module anew."""
+        if first == "run":
+            execute(run, tmp_path)
+        write_module("edited", METHOD.replace("0.5", "0.25"))
+        if first == "edit":
+            importlib.reload(sys.modules["edited"])
+            execute(RunSpec(TINY, "edited:Slow", 0), tmp_path)
+        return {}
+
+    monkeypatch.setattr("clbench.jobs.grid.run_with_bars", edit_and_run)
+    (reason,) = run_missing([run], tmp_path, Here, Console(file=io.StringIO())).values()
+    assert "has other code or settings of edited:Slow than this command began with" in reason
+
+
 def test_inputs_that_fail_are_tried_once_and_told_once(
     tmp_path: Path, empty_caches: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

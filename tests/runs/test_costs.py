@@ -121,6 +121,25 @@ class Masked(Method):
 
 
 @dataclasses.dataclass
+class Listing(Method):
+    """Keeps a list, of which nobody counts the bytes."""
+
+    def state(self) -> Any:
+        return {"losses": [0.5] * 1000}
+
+    def load_state(self, policy: Policy, state: MethodState) -> None:
+        pass
+
+
+@dataclasses.dataclass
+class Silent(Method):
+    """Forgets to return its state."""
+
+    def state(self) -> Any:
+        pass
+
+
+@dataclasses.dataclass
 class Greedy(Method):
     """Draws a second batch of the target from its third step on."""
 
@@ -242,6 +261,8 @@ def test_a_mask_that_no_checkpoint_holds_need_not_be_finite(
     ("method", "where", "message"),
     [
         (Forgetful, "load_state() after stage 0", "load_state() must give a new policy the parameters and "),
+        (Listing, "state() after stage 0", "Booleans and None; 'losses' is of the type list."),
+        (Silent, "state() after stage 0", "state() must return a dictionary, not NoneType."),
         (Endless, "prepare", "The buffer mask is not finite after prepare()."),
         (
             Greedy,

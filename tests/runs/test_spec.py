@@ -75,6 +75,16 @@ def test_a_setting_that_a_record_cannot_hold_is_refused_before_the_run(
         RunSpec(TOY, "strange_field:WithLoss", 0).resolve()
 
 
+def test_a_field_without_a_default_is_refused_even_if_the_run_sets_it(
+    write_module: Callable[[str, str], None],
+) -> None:
+    lines = ["from dataclasses import dataclass", "from clbench import Method", "@dataclass"]
+    lines += ["class Bare(Method):", '    """Has no default."""', "    strength: float"]
+    write_module("bare_field", "\n".join(lines))
+    with pytest.raises(InputError, match=r"Bare refuses its hyper-parameters: .* argument: 'strength'"):
+        RunSpec(TOY, "bare_field:Bare", 0, {"strength": 1.0}).resolve()
+
+
 @pytest.mark.parametrize("text", ["0.50", "1.", "5e-1"])
 def test_a_run_by_name_has_the_path_of_its_record_however_a_value_was_typed(
     text: str, tmp_path: Path

@@ -28,6 +28,20 @@ class Slow(Method):
 
 
 @dataclasses.dataclass
+class OwnOptimiser(Method):
+    """Plain fine-tuning by plain gradient descent, beside an AdamW that moves nothing."""
+
+    def start_task(self, policy: Any, stage: Any) -> Any:
+        parameters = list(policy.parameters())
+        self._own = torch.optim.SGD(parameters, lr=1e-3)
+        return parameters
+
+    def learning_rate(self, scheduled: float, progress: Any) -> float:
+        self._own.step()
+        return 0.0
+
+
+@dataclasses.dataclass
 class OnlyOnce(Method):
     """A method that fails if a stage begins twice in a process."""
 
@@ -72,6 +86,19 @@ def test_a_slow_method_of_a_stranger_has_its_ratio_in_the_record(
     tmp_path: Path, stranger: Callable[[type[Method]], str]
 ) -> None:
     assert _timing(stranger(Slow), tmp_path)["step_ratio"] == 5
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("_a_second_for_each_loss")
+def test_two_optimisers_share_the_time_of_a_step_of_the_loop(
+    tmp_path: Path, stranger: Callable[[type[Method]], str]
+) -> None:
+    ours, plain = (
+        execute(RunSpec(TINY.id, method, 0, targets=1), tmp_path)
+        for method in (stranger(OwnOptimiser), "sft")
+    )
+    assert ours.costs.optimiser_steps == 2 * (plain.costs.optimiser_steps or 0)
+    assert ours.timing["step_ratio"] == 0.5  # the time of all steps is then that of plain fine-tuning
 
 
 @pytest.mark.long
