@@ -21,7 +21,7 @@ from torch import Tensor
 from clbench.base.cache import cached, hash_of, is_cached, minari_folder
 from clbench.base.dependencies import versions
 from clbench.base.entry_points import resolve
-from clbench.base.errors import InputError
+from clbench.base.errors import InputError, WrongTypeError
 from clbench.base.leftovers import replacing
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import derive_seed, numpy_generator
@@ -70,15 +70,26 @@ def demonstrate(world: World, task: Task, seed: int, noisy: bool) -> Demonstrati
 
     Raises:
         LeakError: The running hooks of a method must not read demonstrations of the task.
+        WrongTypeError: The expert returns something other than an action of the world.
     """
     check_demonstrations(task.name)
     expert = resolve(task.expert)(task.name)
     generator = np.random.default_rng([seed, 1])
     low, high = _action_bounds(world)
+
+    def label(state: NDArray[np.float32]) -> NDArray[np.float32]:
+        action = np.array(expert(state), np.float32)  # None becomes NaN
+        if action.shape != low.shape:
+            raise WrongTypeError(
+                f"The expert {task.expert} of task {task.name} must return an action of shape {low.shape}, "
+                f"not of {action.shape}."
+            )
+        return action
+
     state, _ = world.reset(seed=seed, options={"task": task.name})
     # copies: a world or an expert may return the same array in every step
     states, executed, random, rewards = [np.array(state, np.float32)], [], [], []
-    labels = [np.array(expert(state), np.float32)]
+    labels = [label(state)]
     success, remaining = False, 0
     for _ in range(task.horizon):
         if noisy and remaining == 0 and generator.random() < task.action_noise:
@@ -90,7 +101,7 @@ def demonstrate(world: World, task: Task, seed: int, noisy: bool) -> Demonstrati
         state, reward, terminated, _, _ = world.step(action)
         states.append(np.array(state, np.float32))
         executed.append(action)
-        labels.append(np.array(expert(state), np.float32))
+        labels.append(label(state))
         rewards.append(float(reward))
         if terminated:
             success = True

@@ -159,7 +159,8 @@ class Questions:
             if not len(rows):
                 raise InputError(
                     f"No state gives the answer {answer!r} to the question {kind.name!r}: "
-                    f"{kind.wordings[0]!r}."
+                    f"{kind.wordings[0]!r}. There are {len(answers)} states here; more question_episodes in "
+                    "the budget give more, to the questions of the test, too."
                 )
         return cells
 

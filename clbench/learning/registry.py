@@ -37,6 +37,8 @@ def load_method(spec: str) -> type[Method]:
         WrongTypeError: The object of this name is not a method, has a hook that is misspelt or that the loop
             cannot call, or has a declaration, such as `uses`, of another type.
     """
+    if not isinstance(spec, str):
+        raise WrongTypeError(f"The name of a method or 'module:Class' is needed, not {spec!r}.")
     if ":" in spec:
         cls = resolve(spec)
     elif spec in (installed := built_in_methods()) or spec in (installed := installed_methods()):
@@ -99,7 +101,7 @@ def read_changes(spec: str, cls: type[Method], changes: Mapping[str, Any]) -> di
             f"{spec}: the type of a field cannot be read ({error}). It must have a meaning in the module "
             "itself: a name that is imported under `if TYPE_CHECKING` has none."
         ) from error
-    fields = [field.name for field in dataclasses.fields(cls)]
+    fields = [field.name for field in dataclasses.fields(cls) if field.init]
     values = {}
     for name, value in changes.items():
         if name not in fields:
@@ -208,4 +210,5 @@ def _read(name: str, text: str, hint: Any) -> Any:
         if kind is not bool:
             with contextlib.suppress(ValueError):
                 return kind(text)
-    raise InputError(f"{name} must be {_words(kinds)}, not {text!r}.")
+    form = ": a list is JSON, such as [1, 2]" if any(get_origin(kind) is list for kind in kinds) else ""
+    raise InputError(f"{name} must be {_words(kinds)}, not {text!r}{form}.")

@@ -13,7 +13,7 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 
 from clbench.base.entry_points import class_hint, unknown
-from clbench.base.errors import InputError, UnknownNameError
+from clbench.base.errors import InputError, UnknownNameError, WrongTypeError
 from clbench.base.text import did_you_mean, quoted
 from clbench.spec.fields import LONGEST
 from clbench.spec.policies import policy_names
@@ -99,6 +99,8 @@ def check_scenario_id(scenario: str) -> None:
     Raises:
         InputError: It does not have the form "namespace/Name-v0", or looks like another registered id.
     """
+    if not isinstance(scenario, str):
+        raise WrongTypeError(f"The id of a scenario is a string such as 'me/Mine-v0', not {scenario!r:.60}.")
     if len(scenario) > LONGEST or not _SCENARIO.fullmatch(scenario):
         raise InputError(
             f"{quoted(scenario)} cannot be the id of a scenario: it must be of the form namespace/Name-v0."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import multiprocessing
 
 import gymnasium
 from gymnasium.envs import registration
@@ -97,6 +98,10 @@ def registered_scenario(scenario_id: str) -> Scenario:
         UnknownNameError: No scenario is registered under this id.
         InputError: An instruction is too long or cannot be spelled, or a user's module raises an error.
     """
+    if not isinstance(scenario_id, str):
+        raise WrongTypeError(
+            f"The id of a scenario is needed, such as 'clbench/Fetch-v1', not {scenario_id!r:.60}."
+        )
     module, _, name = scenario_id.rpartition(":")
     if module:
         import_module(module, scenario_id)
@@ -163,9 +168,11 @@ def _spelled(scenario: Scenario) -> Scenario:
 
 @functools.cache
 def _warn_of_spelled_words(name: str, instructions: tuple[str, ...]) -> None:
-    """Warn of words in the instructions of a scenario that look misspelled, once."""
+    """Warn of words in the instructions of a scenario that look misspelled, once and not in workers."""
     from clbench.spec.language import spelled_words, vocabulary
 
+    if multiprocessing.parent_process() is not None:
+        return
     for word in spelled_words(instructions):
         if hint := did_you_mean(word, vocabulary()):
             LOG.warning(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from clbench.base.cache import CacheError
 from clbench.base.entry_points import resolve
-from clbench.base.errors import InputError
+from clbench.base.errors import InputError, WrongTypeError
 from clbench.data.demonstrations import (
     Demonstration,
     Demonstrations,
@@ -198,6 +198,15 @@ def test_an_expert_that_mostly_fails_is_named(monkeypatch: pytest.MonkeyPatch) -
     )
     with pytest.raises(InputError, match=r"The expert of 'left' succeeded 0 times in 10 attempts"):
         collect(lazy, BUDGET)
+
+
+def test_an_expert_that_returns_no_action_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    silent = dataclasses.replace(TASK, expert="clbench.testing:silent_expert")
+    monkeypatch.setattr("clbench.testing.silent_expert", lambda _: lambda state: None, raising=False)
+    with pytest.raises(
+        WrongTypeError, match=r"silent_expert of task left must return .* of shape \(2,\), not"
+    ):
+        collect(silent, BUDGET)
 
 
 def _episode(noisy: list[bool]) -> Demonstration:

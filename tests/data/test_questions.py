@@ -98,7 +98,9 @@ def test_an_answer_that_no_state_gives_is_named() -> None:
         "place", ("where is it",), ("left", "right"), lambda states: np.zeros(len(states), np.int64)
     )
     with pytest.raises(
-        ValueError, match="No state gives the answer 'right' to the question 'place': 'where is it'"
+        ValueError,
+        match=r"No state gives the answer 'right' to the question 'place': 'where is it'\. "
+        "There are 5 states here; more question_episodes",
     ):
         Questions((kind,), torch.zeros(5, 4))
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from helpers import build_method
 
-from clbench.base.errors import InputError
+from clbench.base.errors import InputError, WrongTypeError
 from clbench.data.demonstrations import Demonstrations
 from clbench.learning.method import Metadata, Method
 from clbench.learning.prior import Prior, Source, UndeclaredAccessError
@@ -81,6 +81,12 @@ def test_an_object_that_is_no_method_is_refused_by_name(
         load_method(spec)
 
 
+@pytest.mark.parametrize("given", [None, 5, Method])
+def test_a_name_is_asked_for_where_something_else_is_given(given: Any) -> None:
+    with pytest.raises(WrongTypeError, match="The name of a method or 'module:Class' is needed, not "):
+        load_method(given)
+
+
 @pytest.mark.usefixtures("module")
 def test_changes_from_the_command_line_take_the_types_of_the_fields() -> None:
     method = build_method("stranger:Acme", {"strength": "0.25", "rounds": "7", "gentle": "true"})
@@ -98,6 +104,18 @@ class Chooses(Method):
 
     mode: Literal["slow", "fast"] = "slow"
     layers: list[int] = dataclasses.field(default_factory=list)
+
+
+@dataclasses.dataclass
+class Counts(Chooses):
+    """A method with a counter, which nobody sets."""
+
+    count: int = dataclasses.field(default=0, init=False)
+
+
+def test_a_field_that_nobody_sets_is_no_hyper_parameter(stranger: Callable[[type[Method]], str]) -> None:
+    with pytest.raises(LookupError, match=r"no hyper-parameter 'count'.* It has: step_factor, mode, layers"):
+        build_method(stranger(Counts), {"count": "3"})
 
 
 def test_a_choice_and_a_list_are_read_from_the_command_line(stranger: Callable[[type[Method]], str]) -> None:
@@ -120,6 +138,7 @@ def test_a_choice_that_is_none_names_the_choices(
         ([0.5], "layers: item 1 must be a whole number, not 0.5"),
         (5, r"layers must be list\[int\], not 5"),
         ("5", r"layers must be list\[int\], not '5'"),
+        ("1,2", r"layers must be list\[int\], not '1,2': a list is JSON, such as \[1, 2\]"),
     ],
 )
 def test_a_list_with_an_item_of_another_type_is_refused_by_name(

@@ -1,6 +1,7 @@
 """A stranger's scenario: its registration, and the errors of wrong ones."""
 
 import dataclasses
+import multiprocessing
 import sys
 import types
 from collections.abc import Iterator
@@ -9,6 +10,7 @@ from typing import Any
 import gymnasium
 import pytest
 
+from clbench.base.errors import WrongTypeError
 from clbench.spec.language import UnknownWordError
 from clbench.spec.registry import load_scenario, opened_scenario, register
 from clbench.spec.scenario import Scenario
@@ -157,6 +159,26 @@ def test_a_word_near_to_one_of_the_vocabulary_is_spelled_with_one_warning(
         "'wright' is not in the vocabulary, so the policy reads it in pieces. Did you mean 'right'?"
         in warning
     )
+
+
+@pytest.mark.parametrize("given", [None, 5, ["clbench/Fetch-v1"], MINE])
+def test_an_id_is_asked_for_where_something_else_is_given(given: Any) -> None:
+    with pytest.raises(
+        WrongTypeError, match="The id of a scenario is needed, such as 'clbench/Fetch-v1', not "
+    ):
+        load_scenario(given)
+    with pytest.raises(WrongTypeError, match="The id of a scenario is a string such as 'me/Mine-v0', not "):
+        register(given, "strangers_module:MINE")
+
+
+def test_workers_do_not_repeat_the_warning_of_the_command(
+    module: types.ModuleType, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(multiprocessing, "parent_process", lambda: "the command")
+    strange = dataclasses.replace(MINE.target[0], instructions=("go wright to the worker",))
+    vars(module).update(QUIET=dataclasses.replace(MINE, target=(strange,)))
+    opened_scenario("strangers_module:QUIET")
+    assert not caplog.records
 
 
 def _lambda(state: object) -> object:
