@@ -188,7 +188,7 @@ def submit(
     from clbench.runs.spec import RunSpec, check_device
 
     from .board.rows import compute_board
-    from .publishing import inputs_of, site_of, write_site
+    from .publishing import check_site, inputs_of, site_of, write_site
     from .submission.submit import placement, run_submission
     from .views.files import print_written
 
@@ -199,6 +199,7 @@ def submit(
         runs = [replace(first, seed=first_seed + number).resolve() for number in range(seeds)]
         folders = {"--records": records, "--checkpoints": checkpoints, "The board's folder": site_of(records)}
         check_folders(folders)
+        check_site(records)
         went_well = run_submission(runs, records, workers, checkpoints)
     if went_well is None:
         raise SystemExit(1)
@@ -334,7 +335,7 @@ def _placed(found: list[Path], records: Path) -> tuple[list[Path], Path]:
         home = None if in_place else _home_of(path)
         if home is not None:
             raise InputError(f"{path} belongs below {home}: add --records {home}.")
-    typed = all(path.is_relative_to(records) for path in found)
+    typed = all(path.is_relative_to(records) and ".." not in path.parts for path in found)
     return (found, records) if typed else (absolute, folder)
 
 

@@ -133,15 +133,24 @@ def read_board(records: Path) -> Summary:
     return read_unchanged(records, inputs_of(records)) or compute_board(records)
 
 
+def check_site(records: Path) -> None:
+    """Refuse a link in the place of the board's folder: it may lead to files of others.
+
+    Raises:
+        InputError: It is a link.
+    """
+    site = site_of(records)
+    if site.is_symlink():
+        raise InputError(f"{site} is a symbolic link, which is not followed. Put a folder in its place.")
+
+
 def write_site(board: Board, records: Path, inputs: dict[str, str]) -> dict[Path, bool]:
     """Write every form of the board to the folder of the board, and return which files changed.
 
     Raises:
         InputError: The folder is a link, or the file system refuses one of the files.
     """
-    site = site_of(records)
-    if site.is_symlink():
-        raise InputError(f"{site} is a symbolic link, which is not followed. Put a folder in its place.")
+    check_site(records)
     # They load the charts, SciPy and PyTorch: 3 s.
     from .policies.compared import by_table
     from .views import page as web_page
@@ -157,11 +166,12 @@ def write_site(board: Board, records: Path, inputs: dict[str, str]) -> dict[Path
     files = {name: _hash_of_bytes(text.encode()) for name, text in texts.items()}
     kept = {"made_from": inputs, "files": files, "board": board.to_json()}
     texts[NUMBERS] = json.dumps({**kept, "content": content_hash(kept)}, indent=1) + "\n"
+    site = site_of(records)
     sweep(site)
     former = _files_of(site)
     written = write_all({site / name: text for name, text in texts.items()})
     for name in former - texts.keys():  # such as the picture of a frontier that no longer exists
-        if (site / name).is_file():  # a stranger's list may name "..", too
+        if os.path.isfile(site / name):  # a stranger's list may name "..", or what no file can be called
             (site / name).unlink()
     return written
 

@@ -298,7 +298,7 @@ def _table(name: str, found: Mapping[str, tuple[Settings | None, Sequence[Tried]
 
 
 def _choice(method: str, tuned: Tuned) -> str:
-    """Return the chosen settings in words, which a file shows, too, and whether they learn too little."""
+    """Return in words which settings are chosen, as a file shows no bold, and whether they learn enough."""
     from clbench.runs.tuning import LEARNED
 
     text = f"{method}: {_words(tuned.settings)} is chosen."

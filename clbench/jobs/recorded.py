@@ -80,7 +80,7 @@ def is_of_other_code(run: ResolvedRun, path: Path) -> bool:
         record = read_record(path)
     except RecordError:
         return False
-    edited = changed_code(record, run) or not has_settings_of(record, run)
+    edited = changed_code(record, run) or {**run.defaults, **record.run.settings} != run.info.settings
     return record.status == "success" and ":" in run.spec.method and bool(edited)
 
 

@@ -109,15 +109,15 @@ def _is_ladder(runs: Sequence[Run]) -> bool:
 
 
 def on_the_ladder(runs: list[Run]) -> Sifted:
-    """Keep the runs that changed the learning rate, to a value that tells it from all others.
+    """Keep the runs that changed the learning rate, to a positive value that tells it from all others.
 
     A run writes 1.0. With 1 or 1.0000001 in its place, a seed would have two records of one rung, which
     claims name by six digits.
     """
-    fault = f"its changes have no {FACTOR}, the ladder's setting, such as 0.3 or 1.0."
+    fault = f"its changes have no {FACTOR}, the ladder's setting, of up to six digits, such as 0.3 or 1.0."
 
     def is_rung(factor: Any) -> bool:
-        return isinstance(factor, float) and is_number(factor) and factor == float(f"{factor:g}")
+        return isinstance(factor, float) and is_number(factor) and 0 < factor == float(f"{factor:g}")
 
     return sift_by(runs, lambda run: "" if is_rung(run.record.run.changes.get(FACTOR)) else fault)
 

@@ -219,8 +219,8 @@ def _seeds_for(figure: Figure, bar: float) -> int | None:
 def _reach(figure: Figure, end: float) -> float:
     """Return what the quantile times the error is proportional to if the interval has this end.
 
-    It is the distance, of a ratio that of the logarithms; between two bounds, as in `interval_of_seeds`, the
-    error is smaller near a bound.
+    It is the distance from the value to the end, for a ratio on the logarithm. Between two bounds, as in
+    `interval_of_seeds`, the error is smaller near a bound.
     """
     if figure.ratio and figure.low > 0:
         return abs(math.log(figure.value / end))

@@ -153,7 +153,9 @@ def scenario_card(
                 continue
             typed[scenario.id], homes[output / folder_name(scenario.id)] = name, scenario
     # before any world is made; a world that cannot be drawn takes no picture from another scenario
-    faults = {home: choose_renderer(undrawn(scenario, home)) for home, scenario in homes.items()}
+    bare = {home: undrawn(scenario, home) for home, scenario in homes.items()}
+    together = choose_renderer([task for tasks in bare.values() for task in tasks])
+    faults = {home: together and choose_renderer(tasks) for home, tasks in bare.items()}
     for home, scenario in homes.items():
         if (fault := faults[home]) is not None:
             kept = "No pictures are drawn; existing ones are kept unless outdated."

@@ -55,14 +55,18 @@ def picture_path(folder: Path, task: Task) -> Path:
 
 
 def undrawn(scenario: Scenario, folder: Path) -> list[Task]:
-    """Return the tasks without a picture of their present version in the folder of the card."""
+    """Return the tasks with an expert, but without a picture of their present version in the folder."""
     kept = _read(folder)
     return [
         task
-        for task in scenario.tasks
+        for task in _with_expert(scenario)
         if not picture_path(folder, task).is_file()
         or kept.get(task.name, {}).get("version", task.version) != task.version
     ]
+
+
+def _with_expert(scenario: Scenario) -> list[Task]:
+    return [task for task in scenario.tasks if recording_of(task) is None]
 
 
 def choose_renderer(tasks: Sequence[Task]) -> str | None:
@@ -91,9 +95,8 @@ def make_missing(
         drawing: Whether pictures can be drawn.
         console: Console that shows the progress.
     """
-    kept, missing = _read(folder), undrawn(scenario, folder)
-    tasks = [task for task in scenario.tasks if recording_of(task) is None]
-    bare = [task for task in tasks if task in missing] if drawing else []
+    kept, missing, tasks = _read(folder), undrawn(scenario, folder), _with_expert(scenario)
+    bare = missing if drawing else []
     asked = {task.name: {"version": task.version, "episodes": episodes} for task in tasks}
     stale = [task for task in tasks if not asked[task.name].items() <= kept.get(task.name, {}).items()]
     folder.mkdir(parents=True, exist_ok=True)

@@ -27,6 +27,7 @@ from clbench.jobs.processes import Here
 from clbench.jobs.scheduler import run_with_bars
 from clbench.learning.method import Stage
 from clbench.policy.policy import Policy
+from clbench.records.writer import write_record
 from clbench.runs.run import execute
 from clbench.runs.spec import ResolvedRun, RunSpec
 from clbench.runs.stages import has_stages, keep_stages
@@ -194,6 +195,20 @@ def test_a_method_that_is_edited_before_its_run_begins_or_ends_is_named(
     monkeypatch.setattr("clbench.jobs.grid.run_with_bars", edit_and_run)
     (reason,) = run_missing([run], tmp_path, Here, Console(file=io.StringIO())).values()
     assert "has other code or settings of edited:Slow than this command began with" in reason
+
+
+@pytest.mark.long
+def test_a_record_that_another_command_wrote_for_another_device_is_no_sign_of_an_edit(
+    tmp_path: Path, write_module: Callable[[str, str], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_module("unedited", METHOD)
+    spec = RunSpec(TINY, "unedited:Slow", 0)
+    record = execute(spec, tmp_path)
+    record.run.device = "cuda"
+    write_record(record, spec.path(tmp_path))
+    monkeypatch.setattr("clbench.jobs.grid.run_with_bars", lambda *_: {})
+    (reason,) = run_missing([spec.resolve()], tmp_path, Here, Console(file=io.StringIO())).values()
+    assert reason.startswith("it ended without a record of this run")
 
 
 def test_inputs_that_fail_are_tried_once_and_told_once(

@@ -1,5 +1,6 @@
 """Copies of the published records in folders of your own."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -49,7 +50,8 @@ def test_a_list_of_files_that_names_another_folder_removes_nothing(
 ) -> None:
     site = four_methods.parent / "site"
     site.mkdir()
-    (site / "board.json").write_text('{"files": {"..": "", "\\u0000": ""}}', encoding="utf-8")
+    names = {"..": "", "\0": "", "a" * 300: ""}
+    (site / "board.json").write_text(json.dumps({"files": names}), encoding="utf-8")
     _, page = shown()
     assert (site / "LEADERBOARD.md").read_text(encoding="utf-8") == page
     assert four_methods.is_dir()

@@ -46,8 +46,8 @@ def test_one_learning_rate_is_no_ladder(even_board: Callable[..., Path]) -> None
     assert not compute_board(even_board("sft", 0, 0.1)).frontiers
 
 
-@pytest.mark.parametrize("factor", [1, 1.0000001])
-def test_a_learning_rate_written_in_another_way_takes_no_record_of_a_rung_away(
+@pytest.mark.parametrize("factor", [1, 1.0000001, 0.0, -1.0])
+def test_a_learning_rate_that_no_run_writes_is_no_rung_and_takes_no_record_of_one_away(
     factor: float, even_board: Callable[..., Path]
 ) -> None:
     for honest in (1.0, 0.3):
@@ -61,7 +61,7 @@ def test_a_learning_rate_written_in_another_way_takes_no_record_of_a_rung_away(
     ]
     (refused,) = board.not_shown
     assert refused.path == f"ladder/Even-v1/sft+step_factor={factor}/seed-0.json"
-    assert "its changes have no step_factor, the ladder's setting" in refused.reason
+    assert "its changes have no step_factor, the ladder's setting, of up to six digits" in refused.reason
 
 
 def test_a_ladder_of_another_simulator_has_no_curve_and_the_board_says_why(

@@ -27,6 +27,11 @@ RECORDED = dataclasses.replace(
 UNLIT = dataclasses.replace(
     TOY, id="me/Unlit-v0", held_out=(dataclasses.replace(LAST, world=f"{__name__}:Unlit"),)
 )
+BOTH = dataclasses.replace(
+    RECORDED,
+    id="me/Both-v0",
+    held_out=(dataclasses.replace(RECORDED.held_out[0], world=f"{__name__}:Unlit"),),
+)
 
 
 @pytest.fixture
@@ -37,7 +42,7 @@ def cards(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]
         "clbench.worlds.gl_backend.rendering_fault",
         lambda _, world=None: "it is dark" if world == f"{__name__}:Unlit" else None,
     )
-    for name, scenario in (("RECORDED", RECORDED), ("UNLIT", UNLIT)):
+    for name, scenario in (("RECORDED", RECORDED), ("UNLIT", UNLIT), ("BOTH", BOTH)):
         spec = EnvSpec(scenario.id, kwargs={"scenario": f"{__name__}:{name}"})
         monkeypatch.setitem(gymnasium.registry, scenario.id, spec)
 
@@ -65,3 +70,29 @@ def test_a_world_that_cannot_be_drawn_takes_no_picture_from_another_scenario(
     assert {path.stem for path in (tmp_path / "Toy-v0").glob("*.webp")} == {task.name for task in TOY.tasks}
     assert not [*(tmp_path / "me--Unlit-v0").glob("*.webp")]
     assert "me/Unlit-v0: No pictures are drawn" in capsys.readouterr().err
+
+
+def test_a_renderer_that_draws_all_scenarios_is_preferred_to_the_first_one_of_some(
+    cards: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("MUJOCO_GL")
+    monkeypatch.setattr("clbench.worlds.gl_backend._BACK_ENDS", ("egl", "osmesa"))
+    monkeypatch.setattr(
+        "clbench.worlds.gl_backend.rendering_fault",
+        lambda back_end, world=None: (
+            "it is dark" if (back_end, world) == ("egl", f"{__name__}:Unlit") else None
+        ),
+    )
+    cards(TOY.id, UNLIT.id)
+    assert {path.stem for path in (tmp_path / "me--Unlit-v0").glob("*.webp")} == {
+        task.name for task in UNLIT.tasks
+    }
+
+
+def test_a_recorded_task_needs_no_renderer(
+    cards: Callable[..., str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cards(BOTH.id)
+    drawn = {task.name for task in BOTH.tasks} - {LAST.name}
+    assert {path.stem for path in (tmp_path / "me--Both-v0").glob("*.webp")} == drawn
+    assert "No pictures are drawn" not in capsys.readouterr().err

@@ -27,6 +27,30 @@ def test_a_linked_folder_of_a_method_is_not_verified_and_nothing_in_it_changes(
     mine.parent.symlink_to(outside)
     for content in ("", "{}"):
         (outside / "seed-0.verified").write_text(content, encoding="utf-8")
-        assert "a symbolic link leads out of" in failures(verify(mine, "recomputed"))
+        assert f"{mine.parent} is a symbolic link, which is not followed" in failures(
+            verify(mine, "recomputed")
+        )
         assert (outside / "seed-0.verified").read_text(encoding="utf-8") == content
         (outside / mine.name).write_text("{}", encoding="utf-8")  # and no record, whose tier would be deleted
+
+
+def test_a_link_to_the_records_of_another_method_does_not_cost_them_their_tier(mine: Path) -> None:
+    kept = mine.with_suffix(".verified")
+    kept.write_text("{}", encoding="utf-8")
+    link = mine.parents[1] / "l2_sp"
+    link.symlink_to(mine.parent, target_is_directory=True)
+    assert f"{link} is a symbolic link, which is not followed" in failures(
+        verify(link / mine.name, "recomputed")
+    )
+    assert kept.read_text(encoding="utf-8") == "{}"
+
+
+@pytest.mark.long
+def test_a_path_with_a_way_up_does_not_cost_a_record_its_tier(mine: Path) -> None:
+    records = mine.parents[2]
+    command(mine, tier="recomputed", scenario=TOY, records=records, workers=1)
+    tier = mine.with_suffix(".verified")
+    assert tier.is_file()
+    around = records / ".." / records.name / mine.relative_to(records)
+    command(around, tier="recomputed", scenario=TOY, records=records, workers=1)
+    assert tier.is_file()

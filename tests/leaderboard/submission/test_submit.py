@@ -141,3 +141,15 @@ def test_a_wrong_word_is_named(
     assert stopped.value.code == 2
     assert reason in " ".join(capsys.readouterr().err.split())
     assert not Path("board").exists()
+
+
+def test_a_link_in_the_place_of_the_board_is_refused_before_any_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("board").mkdir()
+    Path("board/site").symlink_to(tmp_path, target_is_directory=True)
+    with pytest.raises(SystemExit) as stopped:
+        submit("submitted:Mine")
+    assert stopped.value.code == 2
+    assert "site is a symbolic link, which is not followed" in " ".join(capsys.readouterr().err.split())
+    assert not Path("board/records").exists()
