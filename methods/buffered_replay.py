@@ -1,9 +1,9 @@
 """Buffered replay: experience replay from a buffer of 2 % of the prior demonstrations.
 
-The size of the buffer comes from arXiv 2603.03818. Its authors report that 2 % of the data can be enough to
-prevent forgetting in vision-language-action models. Another reader's note on the paper gives a negative
-backward transfer of 0.1 to 0.2 with 2 % (small networks: 0.4 to 0.5), and nearly none with 20 %. We have read
-only its abstract.
+The size of the buffer comes from arXiv 2603.03818. We have read only its abstract: with replay,
+vision-language-action models forget little, even from little data. Another reader's note on the paper gives a
+negative backward transfer of 0.1 to 0.2 with 2 % of the data (small networks: 0.4 to 0.5), and nearly none
+with 20 %.
 
 Details:
 1. Before the first target, single time steps are drawn at random into the buffer, with replacement; all

@@ -28,9 +28,10 @@ Details:
    trains. The paper drops the module of its objective. No parameter is newly initialised.
 4. theta_meta is the merged policy for all targets of the sequence; the paper fine-tunes on one target.
 5. The regulariser's gradient is added in closed form, lambda |g| sign(theta - theta_meta), with sign(0) = 0.
-6. LoRA is not used: the full matrices are regularised. The paper chose lambda = 1e-4 for 7 billion
-   parameters; here, tuning tried 0.01 and 1. At 1e-4, which is the default and what tuning chose on
-   MetaWorld-v1, the pull is about a ten-thousandth of the loss's gradient: the regulariser is in effect off.
+6. LoRA is not used: the full matrices are regularised. The paper chose lambda = 1e-4 for a policy of 7
+   billion parameters, where the penalty covers only the A matrices of LoRA; here, tuning tried 0.01 and 1. At
+   1e-4, which is the default and what tuning chose on MetaWorld-v1, the pull is about a ten-thousandth of the
+   loss's gradient: the regulariser is in effect off.
 7. The gradients of the regulariser and of the loss are clipped together, to a norm of 1, and go through Adam.
 8. The vector is cached, but the steps that made it count in every row.
 9. If nothing is retained, there is no skill to make a vector from: the run fails and says so.
