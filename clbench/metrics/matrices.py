@@ -19,8 +19,8 @@ Unit = Literal["share", "percent"]
 """Unit of success rates: from 0 to 1, or from 0 to 100."""
 MOST: dict[Unit, float] = {"share": 1.0, "percent": 100.0}
 """The greatest success rate in each unit."""
-ROUNDING = 1e-9
-"""Share by which a mean of rates may exceed the greatest rate, because of the last bits of a sum."""
+ROUNDING = 1e-6
+"""Share by which a mean of rates may exceed the greatest rate: the last bits of a sum in single precision."""
 DOUBTFUL = 2.0
 """Greatest rate above 1 that may well be an erroneous share."""
 MIXED = 0.25

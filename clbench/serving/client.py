@@ -76,8 +76,8 @@ class ServedPolicy:
         """Return chunks of actions (B, H, A) for the observations of B episodes.
 
         Raises:
-            InputError: The request is too large, or the policy failed, took too long, returned no actions, or
-                cannot be reached any more.
+            InputError: The request is too large, or the policy failed, took too long, returned no actions,
+                sent more than one reply to a request, or cannot be reached any more.
         """
         request = pack(observations)
         if len(request) > LARGEST_MESSAGE:
@@ -88,6 +88,7 @@ class ServedPolicy:
         for _ in range(ATTEMPTS):
             connection = self._connected()
             try:
+                self._check_silent(connection)
                 self._send(connection, request)
                 reply = self._receive(connection)
             except _LOST as error:
@@ -165,6 +166,23 @@ class ServedPolicy:
             self._greeting = greeting
             self.metadata, self._opened = metadata, opened.pop_all()
         return connection
+
+    def _check_silent(self, connection: ClientConnection) -> None:
+        """Refuse a message that no request asked for: it would count as the reply to the next request.
+
+        Raises:
+            InputError: There is such a message.
+        """
+        try:
+            message = connection.recv(timeout=0)
+        except TimeoutError:
+            return
+        self.close()
+        text = f" ({_error_of(message)})" if isinstance(message, str) else ""
+        raise InputError(
+            f"The server at {self.address} sent a message that no request asked for{text}: it must send its "
+            "metadata once, and one reply to each request."
+        )
 
     def _send(self, connection: ClientConnection, request: bytes) -> None:
         """Send a request in limited time: a server that never reads it would make the program wait forever.

@@ -23,6 +23,7 @@ from clbench.evaluation.views import SIZE, SimulatorCameras
 from clbench.records.paths import RECORDS
 from clbench.records.reader import RecordError, read_record
 from clbench.records.record import EXTERNAL_USES, Record
+from clbench.records.writer import check_diagnostics
 from clbench.runs.agents import UNFINISHED, StagedRun
 from clbench.spec.fields import is_whole, whole_number
 from clbench.spec.registry import load_scenario
@@ -125,7 +126,8 @@ def score(
     Raises:
         InputError: Another stage comes next, a record exists already, `executed` differs from stage 0, the
             earlier stages had another version of the scenario or its simulator, or other pictures, the
-            actions have the wrong shape, or a name or number is invalid.
+            actions have the wrong shape, a name or number is invalid, or a record cannot hold `data` or
+            `steps`.
         RecordError: The record of the earlier stages cannot be read.
         LeaseLostError: Another program took over the run, or the file of its lease was removed.
         UnknownNameError: A scene has no such camera.
@@ -137,6 +139,7 @@ def score(
     stage = int(stage) if is_whole(stage) else stage  # of NumPy, which JSON cannot hold
     if data is not None and not isinstance(data, str):
         raise WrongTypeError(f"data must be a string, not {data!r}.")
+    check_diagnostics({"data": data, "steps": steps})  # now, and not after hours of episodes
     run = StagedRun(load_scenario(scenario), method, seed, Path(records), EXTERNAL_USES)
     begin = time.perf_counter()
     cameras = SimulatorCameras(pictures, picture_size)

@@ -412,3 +412,9 @@ def test_a_mean_that_exceeds_1_in_its_last_bit_is_a_share() -> None:
     assert from_matrix([[1.0000000000000002]])["final_average"].value == 1.0
     with pytest.raises(InputError, match="per cent"):
         from_matrix([[1.0, 0.5], [0.8, -0.1]], unit="percent")
+
+
+def test_a_mean_in_single_precision_that_exceeds_1_is_a_share() -> None:
+    always = np.nextafter(np.float32(1), np.float32(2))  # such as the sum of 11 times 1 / 11
+    assert from_matrix([[always]])["final_average"].value == 1.0
+    assert from_matrix([[100 * always]]).unit == "percent"

@@ -281,6 +281,28 @@ def test_a_reply_that_is_no_reply_is_an_error(handle: Callable[..., None], messa
         served.close()
 
 
+@pytest.mark.parametrize(
+    "extra", [pack({"actions": np.ones((2, 1, 4))}), f"{TRACEBACK}KeyError: 1\n"], ids=["reply", "error"]
+)
+def test_a_message_that_no_request_asked_for_is_not_taken_for_a_reply(extra: str | bytes) -> None:
+    arrived = threading.Event()
+
+    def handle(connection: ServerConnection) -> None:
+        greet(connection)
+        connection.send(extra)
+        for _ in range(2):  # the client reads the second ping after all that came with the first
+            connection.ping().wait()
+        arrived.set()
+        for _ in connection:
+            connection.send(pack({"actions": np.zeros((2, 1, 4))}))
+
+    with answering(handle) as address:
+        served = ServedPolicy(address)
+        assert arrived.wait(60)
+        with pytest.raises(InputError, match=r"that no request asked for.*one reply to each request"):
+            served(OBSERVATIONS)
+
+
 def test_a_request_that_no_server_would_read_is_refused_before_it_is_sent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -33,6 +33,23 @@ def test_what_a_record_cannot_mean_is_refused(
 
 
 @pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"steps": 2**64}, "steps: a whole number of 65 bits"),
+        ({"data": "x" * 100_001}, "data: a string of 100,001 characters"),
+    ],
+    ids=["steps", "data"],
+)
+def test_what_a_record_cannot_hold_is_refused_before_an_episode_is_played(
+    options: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    asked: list[Any] = []
+    with pytest.raises(ValueError, match=message):
+        score(ID, asked.append, stage=0, method="me/still", records=tmp_path, **options)
+    assert not asked
+
+
+@pytest.mark.parametrize(
     ("chunks", "message"),
     [
         (np.zeros((40, 2, 3)), r"policy's action has the shape \(40, 2, 3\), not \(40, 2, 2\)"),
