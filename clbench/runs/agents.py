@@ -95,8 +95,8 @@ def evaluate_agent(
         InputError: Another stage comes next, the targets are in another order, a record exists already,
             another program evaluates an agent of this name and seed, earlier stages had another version of
             the scenario or its simulator, an action has the wrong shape, an agent of Stable-Baselines3 was
-            trained behind a wrapper that changes observations or actions, or the name, the seed, the steps
-            or the settings are invalid.
+            trained with other spaces or normalised observations, or the name, the seed, the steps or the
+            settings are invalid.
         RecordError: The record of the earlier stages cannot be read.
         LeaseLostError, MachineError: The run was taken over, or its lease removed; no record can be written.
     """
