@@ -302,7 +302,7 @@ def _choice(method: str, tuned: Tuned) -> str:
     from clbench.runs.tuning import LEARNED
 
     text = f"{method}: {_words(tuned.settings)} is chosen."
-    if any((one.learned or 0.0) >= LEARNED for one in tuned.tried):
+    if any(one.learns_enough for one in tuned.tried):
         return text
     return (
         f"{text} No setting has learned {LEARNED}, so this is the first that learns most: give the budget "

@@ -6,6 +6,7 @@ import dataclasses
 import os
 import platform
 from pathlib import Path
+from typing import Any
 
 from clbench.base.errors import InputError
 from clbench.records.fingerprints import machine_of, other_parts
@@ -53,15 +54,20 @@ def is_of(record: Record, run: ResolvedRun, path: Path) -> bool:
 
 
 def has_settings_of(record: Record, run: ResolvedRun) -> bool:
-    """Return whether a record has a run's settings, budget and device; the record may also be perturbed.
+    """Return whether a record has a run's settings, budget and device; the record may also be perturbed."""
+    settings = _all_settings(record, run)
+    perturb = record.run.perturb and run.spec.perturb
+    found = dataclasses.replace(record.run, settings=settings, perturb=perturb)
+    return (found, record.scenario) == (run.info, run.scenario_info)
+
+
+def _all_settings(record: Record, run: ResolvedRun) -> dict[str, Any]:
+    """Return the settings of a record and of its method.
 
     As on the board, a setting that an older record lacks was added later, with a default that changes
     nothing.
     """
-    settings = {**run.defaults, **record.run.settings}
-    perturb = record.run.perturb and run.spec.perturb
-    found = dataclasses.replace(record.run, settings=settings, perturb=perturb)
-    return (found, record.scenario) == (run.info, run.scenario_info)
+    return {**run.defaults, **record.run.settings}
 
 
 def has_failed(run: ResolvedRun, records: Path) -> bool:
@@ -80,8 +86,9 @@ def is_of_other_code(run: ResolvedRun, path: Path) -> bool:
         record = read_record(path)
     except RecordError:
         return False
-    edited = changed_code(record, run) or {**run.defaults, **record.run.settings} != run.info.settings
-    return record.status == "success" and ":" in run.spec.method and bool(edited)
+    if record.status != "success" or ":" not in run.spec.method:
+        return False
+    return bool(changed_code(record, run)) or _all_settings(record, run) != run.info.settings
 
 
 def set_aside(run: ResolvedRun, records: Path) -> str | None:

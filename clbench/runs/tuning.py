@@ -61,6 +61,11 @@ class Tried:
     learned: float | None
     """Success on each target right after it was learned; None if a run failed."""
 
+    @property
+    def learns_enough(self) -> bool:
+        """Whether the success on the targets is at least `LEARNED`."""
+        return self.learned is not None and self.learned >= LEARNED
+
 
 @dataclass(frozen=True)
 class Tuned:
@@ -134,7 +139,7 @@ def best_of(tried: Sequence[Tried]) -> Tried:
 
 def rated_best(tried: Sequence[Tried]) -> list[Tried]:
     """Return the setting that `best_of` chooses, and those with the same score after it."""
-    learners = [one for one in tried if (one.learned or 0.0) >= LEARNED]
+    learners = [one for one in tried if one.learns_enough]
     if not learners:
         most = max(one.learned or 0.0 for one in tried)
         return [one for one in tried if one.learned == most]

@@ -253,9 +253,10 @@ def _lacks_its_curve(subject: Subject) -> bool:
 
     The reader takes such a record for one of a method of whole stages.
     """
-    protocol, method = subject.protocol, subject.resolved.method
-    at_ends = all(protocol.is_end(row.point) for row in subject.run.record.episode_rows())
-    return at_ends and len(protocol.steps) > 1 and not method.whole_stages
+    protocol = subject.protocol
+    if subject.resolved.method.whole_stages or len(protocol.steps) < 2:  # one evaluation, at the end
+        return False
+    return all(protocol.is_end(row.point) for row in subject.run.record.episode_rows())
 
 
 def _check_definition(subject: Subject) -> Check:
