@@ -8,17 +8,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
 
-from clbench.base.text import counted
+from clbench.base.text import counted, printable
+from clbench.records.paths import table_parts
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import METRICS, TITLES
 from clbench.scoring.scores import WEAK, WEAK_WARNING
+from clbench.spec.policies import DEFAULT_POLICY
 
 from ..board.agreement import Concordance, Prediction, RankCorrelation
 from ..board.certainty import TiedGain, side_of_zero
-from ..board.overall import OverallRow
 from ..board.rows import Row, standing_of
 from ..board.summary import DIVISIONS, GAIN, RowSummary
 from ..board.tiers import TIERS
@@ -73,8 +73,6 @@ NAMED = 3
 MISSING = "-"
 """Text for a value that could not be computed."""
 
-Rows: TypeAlias = Sequence[RowSummary] | Sequence[OverallRow]
-
 
 @dataclass(frozen=True)
 class Column:
@@ -93,11 +91,8 @@ class Column:
         return ".0f" if self.metric.units == "optimiser steps" else ".2f"
 
 
-def shown(rows: Rows) -> tuple[Column, ...]:
-    """Return the columns of a table: the metrics of its kind of scenario for which any of `rows` has a value.
-
-    A table over scenarios of both kinds has the metrics of fixed stages.
-    """
+def shown(rows: Sequence[RowSummary]) -> tuple[Column, ...]:
+    """Return the columns of a table: the metrics of its kind of scenario that any of `rows` has."""
     to_criterion = _to_criterion(rows)
     names = TO_CRITERION if to_criterion else FIXED
     found = {name for name in METRICS if any(row.estimates[name].value is not None for row in rows)}
@@ -114,19 +109,26 @@ def column_title(name: str, to_criterion: bool) -> str:
     return (TITLES if to_criterion else {}).get(name) or title_of(name)
 
 
-def fitting(rows: Rows) -> tuple[Column, ...]:
+def fitting(rows: Sequence[RowSummary]) -> tuple[Column, ...]:
     """Return the columns of `rows` that fit into a terminal of 108 columns."""
     names = fitting_names(rows)
     return tuple(one for one in shown(rows) if one.metric.name in names)
 
 
-def fitting_names(rows: Rows) -> tuple[str, ...]:
+def fitting_names(rows: Sequence[RowSummary]) -> tuple[str, ...]:
     """Return the metrics of such columns, including those for which no row has a value."""
     return FITTING_TO_CRITERION if _to_criterion(rows) else FITTING_FIXED
 
 
-def _to_criterion(rows: Rows) -> bool:
+def _to_criterion(rows: Sequence[RowSummary]) -> bool:
     return bool(rows) and all(row.to_criterion for row in rows)
+
+
+def table_title(table: str) -> str:
+    """Return the short name of a table: "Fetch-v1, discrete diffusion"."""
+    scenario, policy = table_parts(table)
+    name = printable(scenario.removeprefix("clbench/"))
+    return name if policy == DEFAULT_POLICY else f"{name}, {printable(title_of(policy))}"
 
 
 def start_text(rate: float | None) -> str:

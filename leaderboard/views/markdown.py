@@ -10,7 +10,7 @@ from clbench.records.paths import table_parts
 from clbench.scoring.metric import Metric
 
 from ..board.certainty import TiedGain, sides_of_gains
-from ..board.overall import overall
+from ..board.grid import grids
 from ..board.rows import Board, Row
 from ..board.summary import letters_of, tables_of
 from ..policies.compared import Comparisons
@@ -24,6 +24,7 @@ from .format import (
     prediction_text,
     shown,
     start_text,
+    table_title,
     tiers_text,
     unpaired_text,
 )
@@ -37,17 +38,17 @@ def markdown(board: Board, comparisons: Comparisons) -> str:
         board: The board.
         comparisons: The comparisons of its rows, from `compared.by_table`.
     """
-    averages = overall(board.rows)
     by_scenario = tables_of(board.rows)
     return template(__file__, "leaderboard.md.jinja").render(
         board=board,
-        averages=averages,
+        grids=[one for one in grids(by_scenario) if len(one.scenarios) > 1],
         by_scenario=by_scenario,
         shown=shown,
         all_shown=_all_shown(by_scenario.values()),
         agreement_text=agreement_text,
         comparisons=comparisons,
         column_title=column_title,
+        table_title=table_title,
         decoding=read_decoding(),
         counted=counted,
         policy_of=lambda table: table_parts(table)[1],

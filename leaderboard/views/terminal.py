@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group, RenderableType
@@ -13,17 +14,17 @@ from rich.table import Table as TextTable
 from rich.text import Text
 
 from clbench.base.text import listed
-from clbench.scoring.intervals import Estimate
+from clbench.scoring.intervals import NO_ESTIMATE, Estimate
 from clbench.scoring.metric import TIE
 from clbench.scoring.metrics import METRICS
+from clbench.spec.policies import DEFAULT_POLICY
 
-from ..board.overall import OverallRow, overall
-from ..board.summary import RowSummary, Summary, divisions_of, letters_of, tables_of
+from ..board.grid import GridRow, grids
+from ..board.summary import RANKED_BY, RowSummary, Summary, divisions_of, letters_of, tables_of
 from ..board.tiers import TIERS
 from .format import (
     MISSING,
     Column,
-    Rows,
     agreement_text,
     aligned,
     column_title,
@@ -32,6 +33,8 @@ from .format import (
     number_text,
     scaled,
     start_text,
+    table_title,
+    title_of,
     unpaired_text,
 )
 
@@ -66,6 +69,8 @@ DROPPED_FIRST = (
 )
 """Columns in the order in which a narrow terminal loses them; what stays longest matters most."""
 
+_Line: TypeAlias = RowSummary | GridRow[RowSummary]
+
 WIDEST_NAME = 20
 """Characters of a method's name that a table keeps on one line if there is no room for more."""
 
@@ -95,7 +100,7 @@ def terminal(table: Summary, width: int = 108, sort: str | None = None) -> Rende
     """
     # Text and not str: rich would obey markup in a stranger's words.
     parts: list[RenderableType] = []
-    tables: list[Rows] = []
+    tables: list[Sequence[RowSummary]] = []
     for scenario, rows in tables_of(table.rows).items():
         tables.append(rows)
         parts += _fitted(scenario, rows, _heads(rows, sort), width)
@@ -107,9 +112,13 @@ def terminal(table: Summary, width: int = 108, sort: str | None = None) -> Rende
         )
         parts += [Text(sentence) for sentence in sentences if sentence]
         parts.append(Text())
-    over_scenarios = overall(table.rows)
-    if over_scenarios:
-        parts += [*_fitted("All scenarios", over_scenarios, _overall_heads(over_scenarios), width), Text()]
+    for grid in grids(tables_of(table.rows)):
+        if len(grid.scenarios) > 1:
+            across = _grid_heads(grid.scenarios)
+            narrow = [head.title for head in reversed(across)]
+            policy = "" if grid.policy == DEFAULT_POLICY else f", {title_of(grid.policy)}"
+            title = f"All scenarios{policy}: {title_of(RANKED_BY)}"
+            parts += [*_fitted(title, grid.methods, across, width, narrow), Text()]
     if parts:
         columns = [one for rows in tables for one in _columns(rows, sort)]
         heads = [one for one in columns if one.metric.higher_is_better is False]
@@ -124,11 +133,15 @@ def terminal(table: Summary, width: int = 108, sort: str | None = None) -> Rende
 
 
 def _fitted(
-    title: str, rows: Sequence[RowSummary | OverallRow], heads: Sequence[_Head], width: int
+    title: str,
+    rows: Sequence[_Line],
+    heads: Sequence[_Head],
+    width: int,
+    dropped_first: Sequence[str] = DROPPED_FIRST,
 ) -> list[RenderableType]:
     """Return a table without the columns that do not fit, and a line that names them."""
     kept, dropped = list(heads), []
-    for name in DROPPED_FIRST:
+    for name in dropped_first:
         if _width(_table(title, rows, kept, WIDEST_NAME)) <= width:
             break
         dropped += [head.title for head in kept if head.title == name and not head.stays]
@@ -148,7 +161,7 @@ def _is_best(value: float | None, best: float | None) -> bool:
 
 def _table(
     title: str,
-    rows: Sequence[RowSummary | OverallRow],
+    rows: Sequence[_Line],
     heads: Sequence[_Head],
     widest_name: int | None = None,
 ) -> TextTable:
@@ -182,7 +195,7 @@ def _best(head: _Head, rows: Sequence[Any]) -> float | None:
     return max(values) if head.higher_is_better else min(values)
 
 
-def _letters(row: RowSummary | OverallRow, rows: Sequence[Any]) -> str:
+def _letters(row: _Line, rows: Sequence[Any]) -> str:
     return aligned(letters_of(row, rows), rows) if isinstance(row, RowSummary) else ""
 
 
@@ -199,13 +212,27 @@ def _heads(rows: list[RowSummary], sort: str | None) -> list[_Head]:
     ]
 
 
-def _overall_heads(rows: Sequence[OverallRow]) -> list[_Head]:
-    """Return the columns of the table over scenarios."""
-    letters = _Head("letters", lambda row: ",".join(letters or MISSING for letters in row.letters))
-    return [letters, *_metric_heads(rows)]
+def _grid_heads(scenarios: Sequence[str]) -> list[_Head]:
+    """Return the columns of the table of methods against scenarios."""
+    column = Column(METRICS[RANKED_BY], title_of(RANKED_BY))
+
+    def head(place: int) -> _Head:
+        def estimate(line: GridRow[RowSummary]) -> Estimate:
+            row = line.rows[place]
+            return row.estimates[RANKED_BY] if row else NO_ESTIMATE
+
+        return _Head(
+            # a word a line, as in other heads: Libero, Spatial-v1
+            re.sub(r"(?<=[a-z])(?=[A-Z])", " ", table_title(scenarios[place])),
+            lambda line: _compact(estimate(line), column),
+            lambda line: estimate(line).value,
+            higher_is_better=True,
+        )
+
+    return [head(place) for place in range(len(scenarios))]
 
 
-def _columns(rows: Rows, sort: str | None) -> list[Column]:
+def _columns(rows: Sequence[RowSummary], sort: str | None) -> list[Column]:
     """Return the columns that fit, and the one by which the rows are sorted."""
     columns = list(fitting(rows))
     if sort is not None and sort not in {column.metric.name for column in columns}:
@@ -213,7 +240,7 @@ def _columns(rows: Rows, sort: str | None) -> list[Column]:
     return columns
 
 
-def _metric_heads(rows: Rows, sort: str | None = None) -> list[_Head]:
+def _metric_heads(rows: Sequence[RowSummary], sort: str | None = None) -> list[_Head]:
     """Return the table's columns for the metrics of `_columns`."""
 
     def head(column: Column) -> _Head:

@@ -1,16 +1,15 @@
-"""Methods against scenarios: one table for each policy, since policies do not mix."""
+"""The heat map: methods against scenarios, one table for each policy."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from clbench.records.paths import table_parts
 from clbench.scoring.metrics import METRICS
-from clbench.spec.policies import DEFAULT_POLICY
 
+from ...board.grid import GridRow, grids
 from ...board.rows import Row
-from ...board.summary import DIVISIONS, RANKED_BY, competing
+from ...board.summary import DIVISIONS, RANKED_BY
 from ..charts.vega import finite
 from ..format import Column, column_title
 from .numbers import MISSING, Number, number
@@ -52,33 +51,12 @@ def heat_maps(tables: Mapping[str, Sequence[Row]]) -> list[HeatMap]:
     Args:
         tables: Rows of each scenario and policy.
     """
-    policies = sorted(
-        {table_parts(name)[1] for name in tables}, key=lambda name: (name != DEFAULT_POLICY, name)
-    )
-    found = []
-    for policy in policies:
-        chosen = {
-            name: {row.method: row for row in rows}
-            for name, rows in tables.items()
-            if table_parts(name)[1] == policy and len(competing(rows)) > 1
-        }
-        if chosen:
-            found.append(HeatMap(policy, tuple(chosen), tuple(_rows(chosen))))
-    return found
+    return [HeatMap(one.policy, one.scenarios, tuple(map(_row, one.methods))) for one in grids(tables)]
 
 
-def _rows(tables: Mapping[str, Mapping[str, Row]]) -> Iterable[HeatRow]:
-    numbers = {
-        method: DIVISIONS.index(row.division) for rows in tables.values() for method, row in rows.items()
-    }
-
-    def place(method: str) -> tuple[int, int, float, str]:
-        rows = [rows[method] for rows in tables.values() if method in rows]
-        return numbers[method], -len(rows), -(rows[0].estimates[RANKED_BY].value or 0.0), method
-
-    for method in sorted(numbers, key=place):
-        cells = [_cell(rows.get(method), column) for column in COLUMNS for rows in tables.values()]
-        yield HeatRow(method, numbers[method], tuple(cells))
+def _row(one: GridRow[Row]) -> HeatRow:
+    cells = tuple(_cell(row, column) for column in COLUMNS for row in one.rows)
+    return HeatRow(one.method, DIVISIONS.index(one.division), cells)
 
 
 def _cell(row: Row | None, column: Column) -> tuple[Number, float | None]:

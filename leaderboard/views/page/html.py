@@ -32,11 +32,11 @@ from ..charts.frontier import frontier
 from ..charts.picture import VEGA_LITE, in_both_themes
 from ..charts.plane import FULL, NARROW, WIDE, Plane, plane, template
 from ..charts.vega import FONT, PALETTE, SHAPES
-from ..format import column_title, format_interval, number_text, title_of
+from ..format import column_title, format_interval, number_text, table_title, title_of
 from .heat import COLUMNS, heat_maps
 from .numbers import MISSING
 from .rows import MAIN
-from .view import ScenarioView, scenarios, sorted_tables, table_title
+from .view import ScenarioView, scenarios, sorted_tables
 
 FOLDER = Path(__file__).parent
 """Folder of the templates, the style and the script."""

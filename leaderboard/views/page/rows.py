@@ -25,7 +25,6 @@ from ..descriptions import Description, describe
 from ..format import (
     NAMED,
     Column,
-    Rows,
     aligned,
     column_title,
     format_interval,
@@ -190,14 +189,14 @@ MAIN = (RANKED_BY, "gain", "adaptation", "retention", "kept_targets", "kept")
 when the reader asks for them."""
 
 
-def columns(rows: Rows) -> tuple[Column, ...]:
+def columns(rows: Sequence[Row]) -> tuple[Column, ...]:
     """Return the columns of a table of `rows`, those of `MAIN` first."""
     main = [Column(METRICS[name], column_title(name, to_criterion=True)) for name in MAIN]
     known = [one for one in main if any(row.estimates[one.metric.name].value is not None for row in rows)]
     return (*known, *(one for one in shown(rows) if one.metric.name not in MAIN))
 
 
-def others(rows: Rows) -> list[Metric]:
+def others(rows: Sequence[Row]) -> list[Metric]:
     """Return the metrics that a table of `rows` does not show; the section of a row lists them separately."""
     there = {one.metric.name for one in columns(rows)}
     return [metric for metric in METRICS.values() if metric.name not in there]

@@ -36,6 +36,7 @@ from ..format import (
     machine_text,
     prediction_text,
     start_text,
+    table_title,
     tiers_text,
     title_of,
     unpaired_text,
@@ -196,13 +197,6 @@ class ScenarioView:
     def competing(self) -> list[RowView]:
         """Rows of the methods that compete."""
         return [view for view in self.rows if view.row.division in METHODS]
-
-
-def table_title(table: str) -> str:
-    """Return the short name of a table: "Fetch-v1, discrete diffusion"."""
-    scenario, policy = table_parts(table)
-    name = printable(scenario.removeprefix("clbench/"))
-    return name if policy == DEFAULT_POLICY else f"{name}, {printable(title_of(policy))}"
 
 
 def sorted_tables(board: Board) -> dict[str, list[Row]]:

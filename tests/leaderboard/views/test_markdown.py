@@ -77,27 +77,26 @@ def test_a_missing_value_is_a_dash_in_markdown_and_empty_in_csv(
 
 
 @pytest.mark.long
-def test_rows_in_every_scenario_are_averaged_over_them(
+def test_two_scenarios_with_rivals_make_a_table_of_final_averages(
     four_methods: Path, add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]]
 ) -> None:
-    assert all("All scenarios" not in text for text in shown())
     for seed in range(2):
         add_full("sft", seed, np.zeros((3, 5)), scenario="clbench/Other-v0")
+    assert all("All scenarios" not in text for text in shown())  # sft has no rival there
+    for seed in range(2):
         add_full("elsewhere", seed, scenario="clbench/Other-v0")
     printed, page = shown()
-    assert "All scenarios" in printed
+    assert "All scenarios: final average" in printed
     section = page.partition("## All scenarios")[2].partition("\n## ")[0]
-    assert "Means over clbench/Other-v0, clbench/Toy-v0, for methods" in section
-    rows = [line for line in section.splitlines() if line.startswith("| ") and "division" not in line]
-    (row,) = [line for line in rows if "---" not in line]
-    frame = load(four_methods)
-    here = frame[(frame.scenario == "clbench/Toy-v0") & (frame.method == "sft")].iloc[0]
-    there = frame[(frame.scenario == "clbench/Other-v0") & (frame.method == "sft")].iloc[0]
-    assert there.final_average == 0.0
-    mean = here.final_average / 2
-    low = mean - np.hypot(here.final_average - here.final_average_low, 0.0) / 2
-    assert row.startswith("| sft | prior-data-free | a, - | ")  # in one of them it is alone
-    assert f"| {mean:.2f} [{low:.2f}, " in row
+    lines = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("|")]
+    assert lines[0] == ["method", "division", "Other-v0", "Toy-v0"]
+    cells = {method: numbers for method, _, *numbers in lines[2:]}
+    here = load(four_methods).set_index(["scenario", "method"]).loc[("clbench/Toy-v0", "sft")]
+    low, high = here.final_average_low, here.final_average_high
+    assert cells["sft"] == ["0.00 [0.00, 0.00]", f"{here.final_average:.2f} [{low:.2f}, {high:.2f}]"]
+    assert cells["elsewhere"][1] == cells["asks"][0] == "-"
+    shown_rows = [line.split() for line in printed.partition("All scenarios")[2].splitlines()]
+    assert ["elsewhere", "-"] in [line[::2] for line in shown_rows if len(line) == 3]
 
 
 def test_hostile_task_names_are_refused(
