@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from safetensors import SafetensorError
 
-from clbench.base.errors import ClbenchError
+from clbench.base.errors import ClbenchError, InputError
 from clbench.base.lease import Lease
 from clbench.base.leftovers import finished_name, is_unfinished, unfinished
 from clbench.base.source import files_below
@@ -53,8 +53,8 @@ class CacheError(ClbenchError, OSError):
 def cache_folder() -> Path:
     """Return the cache folder: `CLBENCH_CACHE` if it is set, else clbench in the user's own cache folder."""
     if os.environ.get("CLBENCH_CACHE"):
-        return Path(os.path.realpath(Path(os.environ["CLBENCH_CACHE"]).expanduser()))
-    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser().absolute() / "clbench"
+        return Path(os.path.realpath(_at_home(os.environ["CLBENCH_CACHE"])))
+    return _at_home(os.environ.get("XDG_CACHE_HOME") or "~/.cache").absolute() / "clbench"
 
 
 def minari_folder() -> Path:
@@ -62,7 +62,17 @@ def minari_folder() -> Path:
 
     Minari itself takes an empty value for a folder, and does not expand a tilde.
     """
-    return Path(os.environ.get("MINARI_DATASETS_PATH") or "~/.minari/datasets").expanduser().absolute()
+    return _at_home(os.environ.get("MINARI_DATASETS_PATH") or "~/.minari/datasets").absolute()
+
+
+def _at_home(path: str) -> Path:
+    try:
+        return Path(path).expanduser()
+    except RuntimeError as error:  # a container may run under a user id that has no account
+        raise InputError(
+            f"There is no home folder for {path}: set CLBENCH_CACHE and MINARI_DATASETS_PATH to folders that "
+            "can be written to."
+        ) from error
 
 
 def hash_of(values: Any) -> str:
@@ -124,8 +134,11 @@ def _make(folder: Path, manifest: Mapping[str, Any], make: Callable[[Path], None
     partial.mkdir()
     try:
         make(partial)
-        text = json.dumps({**manifest, "files": _file_hashes(partial)}, indent=1)
+        hashes = _file_hashes(partial)
+        text = json.dumps({**manifest, "files": hashes}, indent=1)
         (partial / MANIFEST).write_text(text, encoding="utf-8")
+        for name in hashes:  # safetensors lets only the owner read its files, whatever the umask allows
+            (partial / name).chmod((partial / MANIFEST).stat().st_mode)
         lease.check()
         if folder.exists():
             folder.rename(partial.with_suffix(".old"))

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from filelock import SoftFileLease, Timeout
+from filelock import LeaseSettingsMismatch, SoftFileLease, Timeout
 
 from clbench.base.errors import ClbenchError
 from clbench.base.progress import remark
@@ -89,7 +89,7 @@ class Lease:
     def _acquires(self) -> bool:
         try:
             self._lock.acquire(blocking=False)
-        except Timeout:
+        except (Timeout, LeaseSettingsMismatch):  # the second one: an owner with another `SECONDS`
             return False
         self._begin = time.monotonic()
         return True

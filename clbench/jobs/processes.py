@@ -20,7 +20,7 @@ from multiprocessing.process import BaseProcess
 from types import ModuleType
 from typing import Any
 
-from clbench.base.errors import ClbenchError
+from clbench.base.errors import ClbenchError, InputError
 from clbench.base.lease import LeaseLostError
 from clbench.base.progress import ProgressCallback, listen
 from clbench.jobs.folders import absolute_places
@@ -273,6 +273,11 @@ def _context() -> Any:
     try:
         with _script_hidden():
             forkserver.ensure_running()
+    except OSError as error:  # the path of a socket has at most 107 characters
+        raise InputError(
+            f"No worker can start: {error}. Workers need a folder for temporary files that has room and a "
+            "short path: set TMPDIR to one."
+        ) from error
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return context

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.optimizer import register_optimizer_step_post_hook
 
-from clbench.base.errors import ClbenchError
+from clbench.base.errors import ClbenchError, InputError
 
 GRADIENT_NORM = 1.0
 """Maximum norm of the gradients; they are clipped after the method has set them."""
@@ -58,7 +58,17 @@ def learning_rate_factor(step: int, steps: int) -> float:
 
 @contextmanager
 def deterministic(device: str = "cpu") -> Iterator[None]:
-    """Use one thread and deterministic kernels in the block, so that a computation repeats bit for bit."""
+    """Use one thread and deterministic kernels in the block, so that a computation repeats bit for bit.
+
+    Raises:
+        InputError: PyTorch's default dtype is not float32.
+    """
+    dtype = torch.get_default_dtype()
+    if dtype != torch.float32:  # the cached policies and evaluations serve all later runs
+        raise InputError(
+            f"PyTorch's default dtype is {dtype}, and clbench computes in torch.float32: call "
+            "torch.set_default_dtype(torch.float32) first."
+        )
     if device != "cpu":
         # with another workspace cuBLAS may choose another kernel each time
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")

@@ -21,7 +21,7 @@ from clbench.data.demonstrations import Demonstrations
 from clbench.data.training_data import TrainingData
 from clbench.learning.adaptation import Step, adapt, check_finite
 from clbench.learning.method import Method, MethodState, Stage
-from clbench.learning.method_state import read_state, write_state
+from clbench.learning.method_state import check_state, read_state, write_state
 from clbench.learning.optimise import MethodError, steps_counted
 from clbench.learning.pretraining import pretrained_policy, pretraining_inputs
 from clbench.learning.prior import Access, Nothing, Prior, Source, twin_of
@@ -208,10 +208,16 @@ class Trainer:
         return Source(data, generator, self.scenario.budget.batch_size, self.device)
 
     def state(self, number: int) -> MethodState:
-        """Return what the method keeps after stage `number`."""
+        """Return what the method keeps after stage `number`.
+
+        Raises:
+            StateError: The files of a state cannot hold it.
+        """
         self.where = f"state() after stage {number}"
         with self._hooks(number):
-            return self.method.state()
+            state = self.method.state()
+        check_state(state)
+        return state
 
     def diagnostics(self, number: int) -> Any:
         """Return what the method reports on stage `number`."""

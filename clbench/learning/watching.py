@@ -12,7 +12,7 @@ import torch
 from clbench.base.cache import cache_folder, cached, hash_of, hash_of_tensors, is_cached
 from clbench.base.progress import ProgressCallback
 from clbench.learning.method import Method, MethodState, Progress
-from clbench.learning.method_state import read_state, write_state
+from clbench.learning.method_state import check_state, read_state, write_state
 from clbench.learning.optimise import MethodError
 from clbench.learning.pretraining import pretrain, pretraining_inputs
 from clbench.learning.registry import describe_method
@@ -81,6 +81,7 @@ def watch(
                 )
         with hooks():
             state = method.state()
+        check_state(state)
         write_state(partial, state)
 
     folder = cache_folder() / "watched" / hash_of(inputs)

@@ -14,12 +14,10 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from clbench.base.seeding import seeded, torch_generator
-from clbench.base.strict_json import StrictJSONError, check_json
 from clbench.base.text import counted, did_you_mean
 from clbench.data.access import LeakError
 from clbench.data.demonstrations import Demonstrations
@@ -28,12 +26,13 @@ from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.adaptation import Step
 from clbench.learning.hooks import HOOKS
 from clbench.learning.method import Method, Stage
+from clbench.learning.method_state import StateError, check_state
 from clbench.learning.optimise import MethodError, deterministic, steps_counted
 from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.prior import Prior, Source, UndeclaredAccessError
 from clbench.learning.trainer import Trainer
 from clbench.learning.watching import watches
-from clbench.policy.batch import Batch, QuestionBatch
+from clbench.policy.batch import Batch
 from clbench.policy.checkpoint import CheckpointError
 from clbench.policy.policy import Policy
 from clbench.runs.fingerprint import arithmetic_hash
@@ -326,28 +325,13 @@ class ToyRun:
         return groups
 
     def _checked_state(self, state: Any) -> Any:
-        if not isinstance(state, dict):
-            raise _bad_state("a dictionary", f"a {type(state).__name__}")
-        for name, value in state.items():
-            if not isinstance(name, str):
-                raise _bad_state("names that are text", repr(name))
-            if not (value is None or isinstance(value, Tensor | str | float | int)):
-                found = f"a {type(value).__name__}, {name!r}"
-                if isinstance(value, Batch | QuestionBatch):
-                    found += "; store its tensors, {**vars(batch)}, and restore them, Batch(**state)"
-                elif isinstance(value, np.generic | np.ndarray):
-                    found += f"; store {name}.item(), or torch.from_numpy({name})"
-                raise _bad_state("a flat dictionary of tensors, strings, numbers, Booleans and None", found)
-            if isinstance(value, Tensor):
-                if value.layout is not torch.strided:
-                    raise _bad_state("dense tensors", f"{name!r} is sparse; store {name}.to_dense()")
-            else:
-                try:
-                    check_json(json.loads(json.dumps(value)), repr(name))  # as a run does
-                except StrictJSONError as error:
-                    expected = "finite numbers and short texts; a tensor may hold any number"
-                    raise _bad_state(expected, str(error)) from error
-            if self.trainer.where != "watch_pretraining":  # a later run has it from the cache
+        try:
+            check_state(state)
+        except StateError as error:
+            expected = f"state() to return {error.expected}"
+            raise ContractError("state", expected, error.found, "state()") from error
+        if self.trainer.where != "watch_pretraining":  # a later run has it from the cache
+            for name, value in state.items():
                 self._keep(self.trainer.where, f"state {name!r}", value)
         return state
 
@@ -422,7 +406,3 @@ def _listed(group: Any) -> Any:
 
 def _unsound(hook: str, expected: str, found: str) -> ContractError:
     return ContractError("sound hooks", f"{hook}() to return {expected}", found, f"{hook}()")
-
-
-def _bad_state(expected: str, found: str) -> ContractError:
-    return ContractError("state", f"state() to return {expected}", found, "state()")

@@ -117,8 +117,9 @@ class Schedule:
             UnknownNameError: The scenario has no such task.
             InputError: The scenario has no such stage, or an option is unknown.
         """
-        if set(options) - {"task", "stage"}:
-            raise InputError(f'Options of reset are "task" and "stage", not {sorted(options)}.')
+        unknown = [name for name in options if name not in ("task", "stage")]
+        if unknown:
+            raise InputError(f'Options of reset are "task" and "stage", not {unknown}.')
         if "task" in options and "stage" in options:
             raise InputError('Options of reset are "task" or "stage", not both: a task determines its stage.')
         if "stage" in options:

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from clbench.base.cache import CacheError, cached, hash_of_tensors, is_cached
 from clbench.base.lease import LeaseLostError, lease_path
@@ -88,6 +89,15 @@ def _refusing(usual: Callable[..., Any], name: str, number: int) -> Callable[...
         return usual(path, *arguments, **options)
 
     return opened
+
+
+def test_every_file_of_a_result_can_be_read_by_those_who_can_read_its_manifest(tmp_path: Path) -> None:
+    def make(folder: Path) -> None:
+        save_file({"weight": torch.ones(1)}, folder / "policy.safetensors")
+        (folder / "own.txt").touch(0o600)
+
+    folder = cached(tmp_path / "x", INPUTS, make)
+    assert {path.stat().st_mode for path in folder.iterdir()} == {(folder / "clbench.json").stat().st_mode}
 
 
 def test_a_result_of_other_inputs_is_made_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -84,8 +84,18 @@ def _from_elsewhere(path: Path) -> None:
     lease_path(path).write_text(text.replace(host, "host=elsewhere"))
 
 
+def _with_other_seconds(path: Path) -> None:
+    """Leave the lease that another version of clbench, with other `SECONDS`, took on another machine."""
+    _from_elsewhere(path)
+    text, seconds = lease_path(path).read_text(), f"duration={leases.SECONDS}"
+    assert seconds in text
+    lease_path(path).write_text(text.replace(seconds, f"duration={2 * leases.SECONDS}"))
+
+
 @pytest.mark.usefixtures("_like_nfs")
-@pytest.mark.parametrize("leave", [_from_elsewhere, lambda path: lease_path(path).touch()])
+@pytest.mark.parametrize(
+    "leave", [_from_elsewhere, _with_other_seconds, lambda path: lease_path(path).touch()]
+)
 def test_a_lease_without_a_heartbeat_is_taken_over_where_names_cannot_be_exchanged(
     tmp_path: Path, leave: Callable[[Path], None]
 ) -> None:

@@ -29,3 +29,14 @@ def test_a_link_that_leads_to_itself_is_named(below: str, empty_caches: Path) ->
         InputError, match=rf"--records {re.escape(str(folder))} cannot be written to: {reason}"
     ):
         check_folders({"--records": folder})
+
+
+def test_a_user_without_a_home_folder_is_told_which_folders_to_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    def has_no_account(_: int) -> None:
+        raise KeyError
+
+    for name in ("HOME", "CLBENCH_CACHE", "XDG_CACHE_HOME", "MINARI_DATASETS_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("pwd.getpwuid", has_no_account)
+    with pytest.raises(InputError, match=r"no home folder for ~/\.cache: set CLBENCH_CACHE and MINARI"):
+        check_folders({})

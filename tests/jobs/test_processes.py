@@ -163,6 +163,24 @@ def test_a_job_that_moves_finds_the_folders_of_data_where_they_were(
     assert f"{tmp_path}/caches/clbench and {tmp_path}/data" in printed(bars)
 
 
+def test_where_no_socket_can_be_made_an_error_names_the_variable_of_temporary_files(tmp_path: Path) -> None:
+    folder = tmp_path / ("x" * 110)
+    folder.mkdir()
+    code = (
+        "from clbench.jobs.job import Job; from clbench.jobs.processes import Processes\n"
+        "Processes(1).start(Job('prints', print, {}, 1))"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "TMPDIR": str(folder)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "InputError: No worker can start: AF_UNIX path too long. " in found.stderr
+    assert "set TMPDIR" in found.stderr
+
+
 def test_leases_are_given_back_if_closing_is_interrupted(tmp_path: Path, bars: Bars) -> None:
     class Interrupted(Processes):
         def events(self) -> Any:

@@ -261,7 +261,7 @@ def test_a_mask_that_no_checkpoint_holds_need_not_be_finite(
     ("method", "where", "message"),
     [
         (Forgetful, "load_state() after stage 0", "load_state() must give a new policy the parameters and "),
-        (Listing, "state() after stage 0", "Booleans and None; 'losses' is of the type list."),
+        (Listing, "state() after stage 0", "Booleans and None, not a list, 'losses'."),
         (Silent, "state() after stage 0", "state() must return a dictionary, not NoneType."),
         (Endless, "prepare", "The buffer mask is not finite after prepare()."),
         (

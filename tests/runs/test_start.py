@@ -14,6 +14,7 @@ from tiny import TINY
 from torch import Tensor
 
 from clbench.base.cache import cache_folder, cached
+from clbench.base.errors import InputError
 from clbench.base.lease import Lease
 from clbench.learning.method import Method
 from clbench.policy.policy import Policy, PolicyConfig
@@ -154,3 +155,12 @@ def test_an_evaluation_that_another_run_makes_at_the_same_time_is_used(
         [row for row in zip(*one.episodes.values(), strict=True) if row[0] == 0] for one in (first, second)
     ]
     assert starts[0] == starts[1] != []
+
+
+def test_no_run_begins_while_another_default_dtype_would_change_what_later_runs_share(tmp_path: Path) -> None:
+    torch.set_default_dtype(torch.float64)
+    try:
+        with pytest.raises(InputError, match=r"torch\.float64.*set_default_dtype\(torch\.float32\)"):
+            execute(RunSpec(TINY.id, "sft", seed=0, targets=1), tmp_path)
+    finally:
+        torch.set_default_dtype(torch.float32)

@@ -384,7 +384,7 @@ FAULTS: list[tuple[type[Method], str, str, str]] = [
         "state 'mask' differs in state() after stage 2 by up to 1",
     ),
     (Infinite, "state", "finite numbers", "'best': a number that is not finite"),
-    (Sparse, "state", "dense tensors", "'mask' is sparse; store mask.to_dense()"),
+    (Sparse, "state", "dense tensors", "a sparse one, 'mask'; store mask.to_dense()"),
     (Integers, "state", "a flat dictionary of tensors", "a int64, 'count'; store count.item()"),
     (
         Steps,

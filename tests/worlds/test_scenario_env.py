@@ -156,6 +156,7 @@ def test_options_choose_a_task_or_a_stage() -> None:
         ({"task": None}, ValueError, 'The option "task" must be a name, not None'),
         ({"task": "left", "stage": 99}, ValueError, "not both"),
         ({"goal": 3}, ValueError, "Options of reset are"),
+        ({"task": "up", 7: 1, "goal": 3}, ValueError, "not \\[7, 'goal'\\]"),
     ],
 )
 def test_wrong_options_are_refused_by_name(
