@@ -51,7 +51,7 @@ BOTH := $(subst $(space),$(comma),$(BOARDS))
 METHODS := aegis consft consft_calibrated experience_replay fast_dvla finch l2_sp lora sft stop_gradient
 REFERENCES := frozen joint from_scratch
 CONSFT_CONTROLS := constant_weight shuffled_weights
-# Further methods that keep demonstrations or what they taught, on Fetch-v1 alone, where a run takes one to four minutes.
+# Further methods that keep demonstrations or what they taught, on Fetch-v1 alone, where a run takes up to five minutes.
 RIVALS := a_gem buffered_replay ewc
 # Methods on PointMaze-v1. Of its ladder, the claims need the first rung only.
 SCHEDULED := consft consft_calibrated
@@ -71,7 +71,7 @@ tuning: .venv/installed-libero
 FIXED := clbench/DMControl-v0,clbench/FetchPixels-v0
 
 # The committed boards. Runs that have a record are skipped: a stopped command goes on. Seeds in fours are whole Latin
-# squares of orders. The policy of size base has one seed: 4.9 million parameters take up to 20 minutes a run.
+# squares of orders. The policy of size base has one seed: 4.9 million parameters take up to 21 minutes a run.
 records: .venv/installed-libero
 	$(BIN)/clbench run clbench/Fetch-v1 sft consft consft_calibrated --seeds 12 --perturb
 	$(BIN)/clbench run clbench/Fetch-v1 $(REFERENCES) $(METHODS) $(CONSFT_CONTROLS) $(RIVALS) --seeds 12

@@ -2,7 +2,8 @@
 
 This control separates the effect of weighting samples from the effect of small weights: it keeps the mean of
 ConSFT's weights (arXiv 2605.08879), but prefers no sample. Its loss is therefore larger than that of ConSFT,
-which gives small weights to large losses.
+which gives small weights to large losses. Adam nearly cancels a mean that stays the same. This control
+therefore differs from plain fine-tuning mostly where the mean rises: detail 6 of `consft`.
 
 Details:
 1. The weights are those of `ConSFTCalibrated`, for the losses of the same step. Each sample gets their mean.

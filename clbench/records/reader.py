@@ -28,7 +28,7 @@ from clbench.spec.identifiers import check_plain
 from clbench.spec.scenario import MOST_ORDERS
 
 MOST_ROWS = 200_000
-"""Most rows of a table. A record of Fetch-v1 has 1,780 episodes."""
+"""Most rows of a table. A record of FetchPixels-v0 has 1,780 episodes."""
 
 FIRST_HASHED = 3
 """First schema whose records have a hash of their content."""

@@ -24,7 +24,7 @@ MOST_POINTS = 100
 
 MOST_CELLS = 20_000
 """Most cells of a table of rates, for example stages x points x tasks: 2,000 replicates of it take 320 MB.
-Fetch-v1 has 240, a sequence of 40 targets among 50 tasks 8,200."""
+FetchPixels-v0 has 240, a sequence of 40 targets among 50 tasks 8,200."""
 
 _HIGHEST = {"update_sparsity": 1.0, "activation_drift": FARTHEST, "shift": FARTHEST, "captured": 1.0}
 """Greatest possible value of each change of the policy, in the order of the columns."""
