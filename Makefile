@@ -76,7 +76,7 @@ records: .venv/installed-libero
 	$(BIN)/clbench run clbench/Fetch-v1 sft consft consft_calibrated --seeds 12 --perturb
 	$(BIN)/clbench run clbench/Fetch-v1 $(REFERENCES) $(METHODS) $(CONSFT_CONTROLS) $(RIVALS) --seeds 12
 	$(BIN)/clbench run clbench/MetaWorld-v1 $(REFERENCES) $(METHODS) $(CONSFT_CONTROLS) --seeds 8
-	$(BIN)/clbench run clbench/PointMaze-v1 $(REFERENCES) $(MAZE) $(CONSFT_CONTROLS) --seeds 4
+	$(BIN)/clbench run clbench/PointMaze-v1 $(REFERENCES) $(MAZE) $(CONSFT_CONTROLS) --seeds 8
 	$(BIN)/clbench run $(KNOWLEDGE) frozen joint sft stop_gradient aegis lora --seeds 4
 	$(BIN)/clbench run clbench/LiberoSpatial-v1 $(SCHEDULED) $(CONSFT_CONTROLS) experience_replay from_scratch frozen joint sft \
 		--seeds 4

@@ -7,7 +7,9 @@ changes.
 
 from __future__ import annotations
 
+import ast
 import hashlib
+import importlib.util
 import json
 import os
 from pathlib import Path
@@ -47,6 +49,9 @@ _CODE = (
     *("clbench.leaderboard.views", "clbench.leaderboard.publishing"),
 )
 """Code that the board and its pages depend on, besides the packages of the installed methods."""
+
+_QUOTED = ("clbench.methods", "clbench.scoring")
+"""Packages whose docstrings the pages quote; the hash of code leaves docstrings out."""
 
 
 def site_of(records: Path) -> Path:
@@ -90,7 +95,19 @@ def inputs_of(records: Path) -> dict[str, str]:
         "decoding": _hash_of_bytes(RESULTS.read_bytes()) if RESULTS.is_file() else "",
         "definitions": _hash_of_bytes(pinned_file().read_bytes()),
         "code": source_hash(*_CODE, *packages),
+        "docstrings": hash_of(_docstrings()),
     }
+
+
+def _docstrings() -> list[str | None]:
+    """Return the docstrings of the packages that the pages quote, in order."""
+    specs = [importlib.util.find_spec(package) for package in _QUOTED]
+    folders = [Path(spec.origin).parent for spec in specs if spec is not None and spec.origin is not None]
+    trees = [ast.parse(path.read_bytes()) for folder in folders for path in sorted(folder.glob("*.py"))]
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef)
+    return [
+        ast.get_docstring(node) for tree in trees for node in ast.walk(tree) if isinstance(node, documented)
+    ]
 
 
 def _folder_hash(folder: Path) -> str:

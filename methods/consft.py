@@ -19,7 +19,7 @@ Details:
    Here T is the length of the stage, so that tau does not reach `tau_end`: at the last of 300 steps it is
    0.39. If the stage ends when the target is learned, T is the median number of steps that plain fine-tuning
    takes to learn a target of MetaWorld-v1. Easy targets are then learned before the schedule ends, as in 12
-   of the 28 stages of `consft` that train there, 8 of 16 on PointMaze-v1, 12 of 45 on Fetch-v1, and 1 of 16
+   of the 28 stages of `consft` that train there, 15 of 32 on PointMaze-v1, 12 of 45 on Fetch-v1, and 1 of 16
    on LiberoSpatial-v1. On PointMaze-v1, plain fine-tuning takes 2.2 to 3.0 times as many steps at the same
    learning rate, so `schedule`, the factor of T, is 3.25. The factor also multiplies the 7.5 steps of T that
    make up for the warm-up: at the scenario's own learning rate, T is 37 there, while plain fine-tuning takes
@@ -30,7 +30,7 @@ Details:
    settings tried, on this page and on the board, does not include it.
 4. At the end temperature a loss of 0.3 still has a weight of 0.22. In the last tenth of the schedule and
    after it, 11 % of the weights of `consft` are above 0.9 on Fetch-v1 and 15 % below 0.01 (MetaWorld-v1: 12
-   and 27 %; PointMaze-v1: 28 and 16 %; LiberoSpatial-v1: 24 and 4 %): with this policy's losses, training
+   and 27 %; PointMaze-v1: 27 and 17 %; LiberoSpatial-v1: 24 and 4 %): with this policy's losses, training
    does not end as plain fine-tuning.
 5. For a policy that fills in masked tokens, the loss is a cross-entropy in nats, and no constant was adapted
    to it: 98 % of the weights are below 0.01 at the start, and 68 % at the end. Such rows say little about

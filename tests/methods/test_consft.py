@@ -262,6 +262,24 @@ def test_the_histogram_counts_the_weights_of_a_policy_with_half_precision() -> N
     assert np.sum(method.diagnostics()["omega_counts"]) == 8
 
 
+@pytest.mark.parametrize("spec", ["consft", "constant_weight"])
+def test_adam_takes_shorter_steps_after_all_weights_have_risen_together(spec: str) -> None:
+    method, place = _started(spec, loss_scale=1.0), torch.zeros(1, requires_grad=True)
+    losses, places = torch.full((4,), 0.05), [0.0]  # at the floor until the schedule ends after 11.5 steps
+
+    def loss_at(step: int) -> Tensor:
+        weights: Tensor = method.weights(losses, Progress(step, 1000, to_criterion=True))
+        return (weights * place).mean()
+
+    def keep(_: int) -> None:
+        places.append(place.item())
+
+    optimise([{"params": [place]}], 1.0, 22, loss_at, after=keep, schedule=lambda _: 1.0)
+    lengths = -np.diff(places)
+    assert lengths[:12] == pytest.approx([1.0] * 12, rel=1e-3)
+    assert lengths[[12, 21]] == pytest.approx([0.42, 0.94], abs=0.01)
+
+
 def test_the_calibrated_variant_and_the_controls_change_only_the_unit_of_the_loss() -> None:
     published, *others = (
         dataclasses.asdict(build_method(name, {}))
