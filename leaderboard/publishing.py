@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from clbench.base.cache import hash_of
 from clbench.base.errors import InputError
 from clbench.base.leftovers import sweep
-from clbench.base.source import package_of, source_hash
+from clbench.base.source import files_below, package_of, source_hash
 from clbench.base.strict_json import StrictJSONError, read_regular
 from clbench.records.content import content_hash
 from clbench.records.pinned import pinned_file
@@ -103,11 +103,17 @@ def _docstrings() -> list[str | None]:
     """Return the docstrings of the packages that the pages quote, in order."""
     specs = [importlib.util.find_spec(package) for package in _QUOTED]
     folders = [Path(spec.origin).parent for spec in specs if spec is not None and spec.origin is not None]
-    trees = [ast.parse(path.read_bytes()) for folder in folders for path in sorted(folder.glob("*.py"))]
+    paths = [path for folder in folders for path in files_below(folder) if path.suffix == ".py"]
+    return [text for path in paths for text in _docstrings_in(path)]
+
+
+def _docstrings_in(path: Path) -> list[str | None]:
+    try:
+        tree = ast.parse(path.read_bytes())
+    except (SyntaxError, ValueError):  # half written, or an editor's: no page can quote it
+        return []
     documented = (ast.Module, ast.ClassDef, ast.FunctionDef)
-    return [
-        ast.get_docstring(node) for tree in trees for node in ast.walk(tree) if isinstance(node, documented)
-    ]
+    return [ast.get_docstring(node) for node in ast.walk(tree) if isinstance(node, documented)]
 
 
 def _folder_hash(folder: Path) -> str:

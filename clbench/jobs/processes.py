@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import multiprocessing
 import os
@@ -36,6 +37,9 @@ LEAVE_SECONDS = 5.0
 CLOSE_SECONDS = 3.0
 """Time for processes to end after SIGTERM, in seconds; then they are killed."""
 _LOOK_SECONDS = 0.5
+
+_LIMITS = (errno.EMFILE, errno.ENFILE, errno.EAGAIN, errno.ENOMEM)
+"""Error numbers of a machine on which no more files can be opened and no more processes can start."""
 
 
 def at_once(device: str) -> int:
@@ -273,11 +277,14 @@ def _context() -> Any:
     try:
         with _script_hidden():
             forkserver.ensure_running()
-    except OSError as error:  # the path of a socket has at most 107 characters
-        raise InputError(
-            f"No worker can start: {error}. Workers need a folder for temporary files that has room and a "
-            "short path: set TMPDIR to one."
-        ) from error
+    except OSError as error:
+        advice = (
+            "Close programs, or raise the limit that `ulimit -a` shows."
+            if error.errno in _LIMITS
+            # the path of a socket has at most 107 characters
+            else "Workers need a folder for temporary files with room and a short path: set TMPDIR to one."
+        )
+        raise InputError(f"No worker can start: {error}. {advice}") from error
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return context

@@ -181,6 +181,21 @@ def test_where_no_socket_can_be_made_an_error_names_the_variable_of_temporary_fi
     assert "set TMPDIR" in found.stderr
 
 
+def test_a_limit_on_open_files_is_not_blamed_on_the_folder_of_temporary_files() -> None:
+    code = (
+        "import os, resource; from multiprocessing import resource_tracker\n"
+        "from clbench.jobs.job import Job; from clbench.jobs.processes import Processes\n"
+        "workers = Processes(1); resource_tracker.ensure_running()\n"
+        "most = len(os.listdir('/proc/self/fd')) + 1\n"
+        "resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))\n"
+        "workers.start(Job('prints', print, {}, 1))"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "InputError: No worker can start: [Errno 24] Too many open files. " in found.stderr
+    assert "ulimit" in found.stderr
+    assert "TMPDIR" not in found.stderr
+
+
 def test_leases_are_given_back_if_closing_is_interrupted(tmp_path: Path, bars: Bars) -> None:
     class Interrupted(Processes):
         def events(self) -> Any:

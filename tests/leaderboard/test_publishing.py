@@ -1,6 +1,8 @@
 """Copies of the published records in folders of your own."""
 
+import importlib.util
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +12,7 @@ from clbench.base.entry_points import resolve
 
 add_published = resolve("clbench.leaderboard.publishing:add_published")
 show = resolve("clbench.leaderboard.cli:show")
+inputs_of = resolve("clbench.leaderboard.publishing:inputs_of")
 
 
 def test_the_ladder_comes_with_the_published_records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -55,3 +58,22 @@ def test_a_list_of_files_that_names_another_folder_removes_nothing(
     _, page = shown()
     assert (site / "LEADERBOARD.md").read_text(encoding="utf-8") == page
     assert four_methods.is_dir()
+
+
+def test_files_that_an_editor_leaves_beside_the_methods_do_not_stop_the_board(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = importlib.util.find_spec("clbench.methods")
+    assert spec is not None
+    assert spec.origin is not None
+    usual, methods = importlib.util.find_spec, tmp_path / "methods"
+    shutil.copytree(Path(spec.origin).parent, methods)
+    spec.origin = str(methods / "__init__.py")
+    monkeypatch.setattr(
+        "importlib.util.find_spec",
+        lambda name, *rest: spec if name == "clbench.methods" else usual(name, *rest),
+    )
+    before = inputs_of(tmp_path / "records")["docstrings"]
+    (methods / ".#sft.py").symlink_to("somebody@node8.815")
+    (methods / "half_written.py").write_text("def half(", encoding="utf-8")
+    assert inputs_of(tmp_path / "records")["docstrings"] == before
