@@ -10,7 +10,7 @@ import logging
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -137,8 +137,9 @@ def _make(folder: Path, manifest: Mapping[str, Any], make: Callable[[Path], None
         hashes = _file_hashes(partial)
         text = json.dumps({**manifest, "files": hashes}, indent=1)
         (partial / MANIFEST).write_text(text, encoding="utf-8")
-        for name in hashes:  # safetensors lets only the owner read its files, whatever the umask allows
-            (partial / name).chmod((partial / MANIFEST).stat().st_mode)
+        with suppress(PermissionError):  # some file systems have no modes
+            for name in hashes:  # safetensors lets only the owner read its files, whatever the umask allows
+                (partial / name).chmod((partial / MANIFEST).stat().st_mode)
         lease.check()
         if folder.exists():
             folder.rename(partial.with_suffix(".old"))

@@ -31,7 +31,7 @@ class StateError(WrongTypeError):
 
 
 def check_state(state: Any) -> None:
-    """Refuse a state that `write_state` could not write, or that would be another one when read.
+    """Refuse a state of a form that the two files cannot hold.
 
     Raises:
         StateError: The state is refused; the message names the entry.
@@ -46,7 +46,7 @@ def check_state(state: Any) -> None:
                 raise StateError("dense tensors", f"a sparse one, {name!r}; store {name}.to_dense()")
         elif value is None or isinstance(value, str | float | int):
             try:
-                check_json(json.loads(json.dumps({name: value})))
+                check_json(json.loads(json.dumps(value)), repr(name))
             except StrictJSONError as error:
                 expected = "finite numbers and short texts (a tensor may hold any number)"
                 raise StateError(expected, str(error).removesuffix(".")) from error
@@ -69,7 +69,9 @@ def write_state(folder: Path, state: MethodState) -> None:
     copies = {name: value.detach().clone().contiguous() for name, value in tensors.items()}
     save_file(copies, folder / "method.safetensors")
     values = {name: value for name, value in state.items() if name not in tensors}
-    (folder / "method.json").write_text(json.dumps(values), encoding="utf-8")
+    text = json.dumps(values)
+    check_json(json.loads(text))  # refuse here what reading the file would refuse, such as a long name
+    (folder / "method.json").write_text(text, encoding="utf-8")
 
 
 def read_state(folder: Path, device: torch.device | str = "cpu") -> MethodState:
