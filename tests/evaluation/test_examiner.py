@@ -57,6 +57,27 @@ def test_a_return_that_is_no_finite_number_is_recorded_as_missing(total: float) 
     assert episode_row(Point(1, 60), Episode("left", "test", 0, False, total, 12)).total_reward is None
 
 
+def test_a_return_is_recorded_with_four_digits() -> None:
+    episode = Episode("left", "test", 0, False, -1.234567, 12)
+    assert episode_row(Point(1, 60), episode).total_reward == -1.2346
+
+
+def test_the_weights_that_moved_are_a_share_of_those_of_the_pretrained_policy() -> None:
+    run = RunSpec("tiny:me/Tiny-v0", "sft", 0).resolve()
+    config = policy_config(run.scenario)
+    pretrained, policy = TransformerPolicy(config), TransformerPolicy(config)
+    with torch.no_grad():
+        for old, new in zip(pretrained.parameters(), policy.parameters(), strict=True):
+            old.fill_(0.5)
+            new.fill_(0.5 * (1 + 1.0005e-3))  # 0.9995e-3 of what it is
+    record = Record("success", run.info, run.scenario_info)
+    data = TrainingData.open(run.scenario, config)
+    examiner = Examiner(run.scenario, run.protocol, data, pretrained, seed=0)
+    examiner.examine(policy, run.protocol.end(0), record)
+    examiner.close()
+    assert record.policy["update_sparsity"] == [0.0]
+
+
 def _moments(policy: Policy, questions: Questions, count: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
     """Return the mean and the deviation of each layer's hidden states on the questions that are scored."""
     _, asked = scored_questions(questions, count)
@@ -117,8 +138,21 @@ def test_a_tuning_run_plays_validation_episodes_alone_also_for_the_captured_shar
 
     monkeypatch.setattr(Evaluator, "play", noted)
     record = Record("success", run.info, run.scenario_info)
-    examiner = Examiner(run.scenario, run.protocol, data, policy, seed=0)
+    skills = tuple(
+        dataclasses.replace(skill, test_instructions=(f"now {skill.instructions[0]}",))
+        for skill in run.scenario.retained
+    )
+    scenario = dataclasses.replace(run.scenario, retained=skills)
+    examiner = Examiner(scenario, run.protocol, data, policy, seed=0)
     examiner.examine(policy, run.protocol.end(1), record, examiner.predictions(policy, 1))
     examiner.close()
     assert record.policy["captured"] != [None]
     assert {trial.split for trial in played} == {"validation"}
+    # in the target's scenes, the skills take turns with their words of both splits
+    target = scenario.target[0]
+    told = [trial.task for trial in played[-run.protocol.captured_episodes :]]
+    assert len(told) > len(skills) > 1
+    assert {(task.name, task.world) for task in told} == {(target.name, target.world)}
+    assert [(task.instructions, task.test_instructions) for task in told] == [
+        (skill.instructions, skill.test_instructions) for skill in skills * len(told)
+    ][: len(told)]

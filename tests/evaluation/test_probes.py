@@ -46,6 +46,18 @@ def test_a_weight_that_was_0_has_moved_if_it_is_more_than_a_hundred_billionth() 
     assert update_sparsity(policy, pretrained) == (total - 1) / total
 
 
+def test_parameters_that_are_not_trained_count_as_unchanged() -> None:
+    pretrained, policy = TransformerPolicy(SMALL), TransformerPolicy(SMALL)
+    for weight in pretrained.parameters():
+        weight.requires_grad_(False)
+    with torch.no_grad():
+        next(policy.parameters()).add_(1.0)
+    moved, total = (
+        sum(one.numel() for one in some) for some in ([next(policy.parameters())], policy.parameters())
+    )
+    assert update_sparsity(policy, pretrained) == (total - moved) / total
+
+
 def test_a_policy_with_other_parameters_has_no_update_sparsity() -> None:
     larger = TransformerPolicy(dataclasses.replace(SMALL, layers=3))
     assert update_sparsity(larger, TransformerPolicy(SMALL)) is None

@@ -288,3 +288,23 @@ def test_actions_are_clipped_before_a_world_gets_them(monkeypatch: pytest.Monkey
     evaluator.play(policy, [Trial(TOY.task("left"), "validation", 0)], watch=lambda _, one: taken.append(one))
     evaluator.close()
     np.testing.assert_array_equal(taken, [[1.0, -1.0]] * len(taken))
+
+
+def test_an_episode_ends_with_its_success_also_in_the_middle_of_a_chunk(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    policy, task = TransformerPolicy(policy_config(TOY)), TOY.task("left")
+    to_the_left = torch.tensor([-0.7, 0.0])
+    monkeypatch.setattr(
+        policy, "act", lambda state, words, noise, image: to_the_left.expand_as(noise).clone()
+    )
+    trials = [Trial(task, "validation", number) for number in range(8)]
+    episodes = Evaluator(TOY, seed=0).play(policy, trials)
+    for trial, episode in zip(trials, episodes, strict=True):
+        world, (start, _) = resolve(task.world)(), start_of(trial, 0)
+        world.reset(seed=start, options={"task": task.name})
+        outcomes = [world.step(to_the_left.numpy())[1:3] for _ in range(episode.length)]
+        assert [success for _, success in outcomes] == [False] * (episode.length - 1) + [True]
+        assert episode.total_reward == pytest.approx(sum(reward for reward, _ in outcomes))
+        assert episode.success
+    assert any(episode.length % policy.config.executed for episode in episodes)

@@ -94,7 +94,9 @@ def test_fields_that_schema_2_lacks_have_their_usual_values() -> None:
     online = read_record(HISTORIC / "schema-2" / "DMControl-v0-sac-online.json")
     assert (online.run.order, online.run.perturb) == (0, False)
     assert online.costs == Costs(parameters=428296, environment_steps=30000)
-    assert read_record(HISTORIC / "schema-2" / "MetaWorld-v0-sft-order-1.json").run.order == 1
+    sft = read_record(HISTORIC / "schema-2" / "MetaWorld-v0-sft-order-1.json")
+    assert (sft.run.order, sft.run.settings) == (1, {"step_factor": 1.0})
+    assert "step_factor" not in online.run.settings  # another program chose its learning rate
 
 
 def test_quantities_that_schema_2_did_not_measure_are_missing() -> None:
@@ -133,6 +135,7 @@ def put(values: dict[str, Any], place: str, value: Any) -> None:
         (2, "policy.shift", [], "policy: schema 2 has no shift"),
         (3, "policy.captured", [], "policy: schema 3 has no captured"),
         (4, "run.policy", "flow", "run: schema 4 has no policy"),
+        (4, "fingerprint.definition", None, r"schema 4: fingerprint\.definition must be an object"),
         (3, "content", None, "its content does not match its hash"),
         (2, "content", "0123", "a record of schema 2 has no content"),
         (2, "scenario", [], "scenario must be an object"),

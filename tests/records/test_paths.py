@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from clbench.records.paths import record_path
+from clbench.records.paths import label_of, record_path
 
 
 def test_every_run_has_a_path_of_its_own_below_the_folder(tmp_path: Path) -> None:
@@ -22,6 +22,12 @@ def test_every_run_has_a_path_of_its_own_below_the_folder(tmp_path: Path) -> Non
     paths = {record_path(tmp_path, *run) for run in runs}
     assert len(paths) == len(runs)
     assert all(path.parent.parent.parent == tmp_path for path in paths)
+
+
+def test_the_order_in_which_settings_were_changed_does_not_matter() -> None:
+    changes = {"strength": 2.0, "kappa": 0.5}
+    backwards = dict(reversed(changes.items()))
+    assert label_of("finch", changes) == label_of("finch", backwards) == "finch+kappa=0.5+strength=2.0"
 
 
 @pytest.mark.parametrize(

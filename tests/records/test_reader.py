@@ -10,7 +10,7 @@ import pytest
 from helpers import sealed
 
 from clbench.records.reader import RecordError, read_record
-from clbench.records.record import Record, Relearning
+from clbench.records.record import Costs, Record, Relearning
 from clbench.records.writer import write_record
 
 RELEARNING: dict[str, Any] = {"skill": "left", "successes": 3, "steps": 14, "met": True}
@@ -103,6 +103,19 @@ def test_a_field_that_does_not_fit_the_schema_is_refused_by_name(
     write_record(record, tmp_path / "record.json")
     change(tmp_path / "record.json", **fields)
     with pytest.raises(RecordError, match=words):
+        read_record(tmp_path / "record.json")
+
+
+@pytest.mark.parametrize("cost", vars(Costs()))
+def test_no_cost_but_the_number_of_added_parameters_may_be_below_0(
+    cost: str, record: Record, tmp_path: Path
+) -> None:
+    write_record(record, tmp_path / "record.json")
+    change(tmp_path / "record.json", costs={**vars(record.costs), cost: -1})
+    if cost == "parameters_added":
+        assert read_record(tmp_path / "record.json").costs.parameters_added == -1
+        return
+    with pytest.raises(RecordError, match=f"costs: {cost} must not be below 0"):
         read_record(tmp_path / "record.json")
 
 

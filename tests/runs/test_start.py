@@ -4,6 +4,7 @@ import dataclasses
 import shutil
 import threading
 import time
+import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,16 @@ from torch import Tensor
 from clbench.base.cache import cache_folder, cached
 from clbench.base.errors import InputError
 from clbench.base.lease import Lease
+from clbench.base.progress import no_progress
 from clbench.learning.method import Method
+from clbench.learning.pretraining import policy_config
 from clbench.policy.policy import Policy, PolicyConfig
 from clbench.policy.transformer import TransformerPolicy
+from clbench.records.record import Record
 from clbench.runs.length import run_length
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
+from clbench.runs.start import evaluate_start
 from clbench.spec.protocol import ScoredSplit
 
 
@@ -120,6 +125,24 @@ def test_a_method_that_changes_how_the_policy_computes_evaluates_for_itself(
     still = execute(RunSpec(TINY.id, stranger(Still), seed=0), tmp_path)
     assert still.retained_at_start() == 0.0
     assert len(list(reports.iterdir())) == 2
+
+
+def test_every_policy_and_every_setting_of_a_method_that_prepares_is_evaluated_for_itself(
+    reports: Path, stranger: Callable[[type[Method]], str]
+) -> None:
+    examined: list[Policy] = []
+    examiner: Any = types.SimpleNamespace(examine=lambda policy, point, record: examined.append(policy))
+    plain = RunSpec(TINY.id, "from_scratch", seed=0)
+    still = RunSpec(TINY.id, stranger(Still), seed=0)
+    config = policy_config(plain.resolve().scenario)
+    one, other = (TransformerPolicy(config, seed=seed) for seed in range(2))
+    asked = [(plain, one), (plain, one), (plain, other)]
+    asked += [(still, one), (dataclasses.replace(still, changes={"step_factor": 0.3}), one), (still, one)]
+    for spec, policy in asked:
+        run = spec.resolve()
+        record = Record("success", run.info, run.scenario_info)
+        evaluate_start(run, examiner, policy, record, no_progress)
+    assert examined == [one, other, one, one]
 
 
 @pytest.mark.long

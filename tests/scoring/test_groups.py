@@ -218,6 +218,11 @@ def test_rows_are_not_told_apart_if_their_common_seeds_say_the_opposite() -> Non
         "single": {0: equal_run(6)},
     }
     assert groups("final_average", rows) == {"one": "a", "two": "a", "single": "a"}
+    # Here the difference in that seed, 0.8, is twice what is needed: it is the order alone that forbids it.
+    certain: dict[str, Runs] = {str(number): row(0, 10, 10, 10, 10, 10) for number in range(4)}
+    certain["single"] = row(8)
+    assert differences_needed("final_average", certain, "0")["single"] < 0.42
+    assert set(groups("final_average", certain).values()) == {"a"}
 
 
 def test_rows_without_a_common_seed_are_compared_by_the_variation_of_runs() -> None:

@@ -1,6 +1,7 @@
 """Intervals over seeds against SciPy and simulations, in the middle of a span and at its bounds."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -83,6 +84,14 @@ def test_seeds_that_differ_in_the_last_bits_have_no_width() -> None:
     assert interval_of_seeds(1.0, 1e-17, 11, (0.0, 1.0)) == (1.0, 1.0)
 
 
+def test_seeds_whose_differences_are_0_but_for_the_last_bits_have_the_error_of_their_episodes() -> None:
+    drawn = np.array([-0.1, 0.1])
+    exact = interval(0.0, np.zeros(3), lambda: drawn, (-1.0, 1.0))
+    assert exact.high is not None
+    assert exact.high > 0.1
+    assert interval(0.0, np.array([0.1 + 0.2 - 0.3, 0.0, 0.0]), lambda: drawn, (-1.0, 1.0)) == exact
+
+
 def test_a_mean_of_two_seeds_at_both_bounds_keeps_wilsons_interval() -> None:
     low, high = of_means(np.array([0.0, 1.0]), (0.0, 1.0))  # the largest error that a mean can have
     assert 0 < low < 0.01
@@ -113,6 +122,7 @@ def test_intervals_hold_rates_near_0_and_1_about_as_often_as_they_should(seeds: 
 
 def test_a_quantity_without_value_for_some_seeds_has_no_interval() -> None:
     assert interval(1.0, np.array([1.0, np.nan])) == Estimate(1.0, None, None)
+    assert interval(1.0, np.array([0.5, 1.5, np.nan])) == Estimate(1.0, None, None)
     assert interval(np.nan, np.array([1.0, 2.0])) == NO_ESTIMATE
     assert interval(1.0, np.zeros(0)) == Estimate(1.0, None, None)
     assert interval(1.0, np.zeros(0), lambda: np.array([1.0, np.nan])) == Estimate(1.0, None, None)
@@ -218,3 +228,20 @@ def test_a_ratio_of_one_seed_has_the_percentiles_of_the_logarithms_of_its_draws(
     ends = np.exp(np.percentile(np.log(drawn), [2.5, 97.5]))
     assert (got.low, got.high) == pytest.approx(tuple(ends))
     assert not got.of_seeds
+
+
+def test_runs_are_paired_by_seed_in_whatever_order_their_seeds_are_given(
+    scores: Callable[..., Scores],
+) -> None:
+    runs = {seed: _run(scores, earlier=one) for seed, one in enumerate((1.0, 0.5, 0.0))}
+    backwards = dict(reversed(runs.items()))
+    nothing = Estimate(0.0, 0.0, 0.0)  # each run minus itself
+    found = estimate(["gain"], runs, np.random.default_rng(0), references={"sft": backwards})
+    assert found["gain"] == nothing
+    assert paired_difference("final_average", runs, backwards, np.random.default_rng(0)) == nothing
+
+
+def test_an_interval_holds_its_value_even_if_the_draws_of_its_episodes_do_not() -> None:
+    above, below = (interval(1.0, np.zeros(0), partial(np.full, 2, drawn)) for drawn in (2.0, 0.0))
+    assert (above.low, above.high) == (1.0, 2.0)
+    assert (below.low, below.high) == (0.0, 1.0)

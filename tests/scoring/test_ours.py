@@ -183,6 +183,19 @@ def test_forward_transfer_has_the_value_worked_out_by_hand(scores: Callable[...,
     assert measure("forward_transfer", run, {"from_scratch": scratch}) == pytest.approx(expected)
 
 
+def test_learning_from_scratch_counts_as_starting_without_success(scores: Callable[..., Scores]) -> None:
+    run = scores([[1.0, 0.0, 0.0], [1.0, 1.0, 0.0]], curves=[[0.5]], steps=(50, 100))
+    scratch = scores([[0.0, 0.4, 0.0], [0.0, 1.0, 0.0]], curves=[[0.5]], steps=(50, 100))
+    assert measure("forward_transfer", run, {"from_scratch": scratch}) == pytest.approx(0.0)
+
+
+def test_a_skill_that_improves_at_the_end_makes_up_for_one_that_is_forgotten(
+    scores: Callable[..., Scores],
+) -> None:
+    run = scores([[0.8, 0.6, 0.0], [0.5, 1.0, 0.9]], groups=(2, 1, 0))
+    assert measure("forgetting", run) == pytest.approx((0.8 - 0.5 + 0.6 - 1.0) / 2)
+
+
 def test_questions_of_all_kinds_count_together_at_the_end_alone(scores: Callable[..., Scores]) -> None:
     answers = {(0, "left"): (10, 10), (2, "left"): (30, 15), (2, "above"): (10, 9)}
     assert measure("question_retention", scores(MATRIX, answers=answers)) == pytest.approx(24 / 40)

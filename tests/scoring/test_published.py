@@ -234,6 +234,13 @@ def test_a_share_of_the_highest_needs_no_success_on_the_one_target_that_its_reas
     assert words in METRICS[name].missing
 
 
+def test_the_highest_success_on_a_target_may_be_the_one_before_any_target(
+    scores: Callable[..., Scores],
+) -> None:
+    run = scores([[0.8, 0.0], [0.4, 0.0], [0.2, 0.9]], groups=(0, 2, 0))
+    assert measure("isolated_forgetting_cora", run) == pytest.approx((0.4 - 0.2) / 0.8)
+
+
 def test_skills_that_were_not_evaluated_on_the_way_have_no_minimum(scores: Callable[..., Scores]) -> None:
     assert measure("minimum_retention", scores(PUBLISHED, curves=OWN_CURVES)) is None
 

@@ -280,6 +280,7 @@ def test_the_order_of_rows_does_not_matter(make_record: MakeRecord) -> None:
         ("split", "perturbed", "there are perturbed ones, but its run does not say perturb"),
         ("success", 0.5, "neither true nor false"),
         ("success", "yes", "neither true nor false"),
+        ("success", None, "neither true nor false"),
         ("success", [], "neither true nor false"),
     ],
 )

@@ -125,6 +125,19 @@ def test_a_method_is_not_tested_together_with_those_that_may_look_at_more(
     assert _apart([sft, lora, *others]) == {"lora"}
 
 
+@pytest.mark.parametrize("division", ["prior-data-free", "prior questions", "prior demonstrations"])
+def test_a_method_of_any_division_is_tested_together_with_plain_fine_tuning(
+    division: str, scores: Callable[..., Any]
+) -> None:
+    low, high = (
+        dict.fromkeys(range(8), scores(np.full((2, 5), rate), groups=(3, 1, 1), episodes=10))
+        for rate in (0.2, 0.9)
+    )
+    better, alike = _row("better", high), _row("alike", low)
+    better.division = alike.division = division
+    assert _apart([_row("sft", low), better, alike]) == {"better"}
+
+
 def test_a_method_that_shares_a_letter_with_plain_fine_tuning_is_not_apart_from_it(
     scores: Callable[..., Any],
 ) -> None:

@@ -40,6 +40,19 @@ def test_curves_of_a_method_with_other_settings_are_named_by_these(even_board: C
     assert [[rung.factor for rung in curve.rungs] for curve in curves] == [[1.0, 0.3]] * 3
 
 
+def test_curves_are_over_the_seeds_that_all_runs_of_the_ladder_have(even_board: Callable[..., Path]) -> None:
+    for factor in (1.0, 0.3):
+        for seed in (0, 1):
+            even_board("finch", seed, 0.2, "ladder", step_factor=factor)
+        even_board("sft", 1, 0.2, "ladder", step_factor=factor)
+    even_board("sft", 2, 0.9, "ladder", step_factor=0.3)  # a lucky seed, which the others do not have
+    curves = compute_board(even_board("sft", 0, 0.1)).frontiers[SCENARIO]
+    assert [(curve.method, [rung.seeds for rung in curve.rungs]) for curve in curves] == [
+        ("sft", [(1,), (1,)]),
+        ("finch", [(1,), (1,)]),
+    ]
+
+
 def test_one_learning_rate_is_no_ladder(even_board: Callable[..., Path]) -> None:
     even_board("finch", 0, 0.2, "ladder", step_factor=0.3)
     even_board("sft", 0, 0.2, "ladder", step_factor=0.3)

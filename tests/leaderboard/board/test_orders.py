@@ -190,3 +190,17 @@ def test_claims_are_judged_in_the_published_order_alone(
     add(0.9, order=1)
     claims(records=records, output=tmp_path / "after.md", **folders)
     assert (tmp_path / "after.md").read_bytes() == (tmp_path / "before.md").read_bytes()
+
+
+def test_targets_in_an_order_that_is_not_its_own_inverse_are_compared_in_the_published_one(
+    add: Callable[..., Path], records: Path
+) -> None:
+    add(0.5)
+    add(0.5, order=3)
+    board = compute_board(records)
+    assert board.not_shown == ()
+    (row,) = board.rows
+    assert [order.targets for order in row.orders.orders] == [
+        ("target_0", "target_1", "target_2"),
+        ("target_1", "target_2", "target_0"),
+    ]

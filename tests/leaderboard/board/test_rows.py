@@ -293,3 +293,34 @@ def test_a_relative_cost_takes_steps_and_times_of_the_seeds_that_both_methods_ha
     for run, steps, ratio in figures:
         run.record.costs.optimiser_steps, run.record.timing["step_ratio"] = steps, ratio
     assert costs_of(runs["lora"], runs["sft"])["relative_cost"] == pytest.approx(20 / 40 * 3.0)
+
+
+def test_the_time_of_a_step_is_the_geometric_mean_of_the_seeds_that_measured_it(
+    even_board: Callable[..., Path],
+) -> None:
+    for seed in range(3):
+        even_board("sft", seed, 0.5)
+        records = even_board("lora", seed, 0.5)
+    runs = {row.method: row.runs for row in compute_board(records).rows}
+    for run, ratio in zip(runs["lora"], (2.0, 8.0, None), strict=True):
+        run.record.costs.optimiser_steps = runs["sft"][0].record.costs.optimiser_steps
+        run.record.timing["step_ratio"] = ratio
+    assert costs_of(runs["lora"], runs["sft"])["relative_cost"] == pytest.approx(4.0)
+
+
+def test_a_method_without_a_step_costs_nothing_though_no_time_of_a_step_was_measured(
+    even_board: Callable[..., Path],
+) -> None:
+    even_board("sft", 0, 0.5)
+    runs = {row.method: row.runs for row in compute_board(even_board("frozen", 0, 0.5)).rows}
+    runs["frozen"][0].record.costs.optimiser_steps = 0
+    runs["frozen"][0].record.timing["step_ratio"] = None
+    assert costs_of(runs["frozen"], runs["sft"])["relative_cost"] == 0.0
+    assert costs_of(runs["frozen"], [])["relative_cost"] == 0.0
+
+
+def test_references_are_in_no_group(even_board: Callable[..., Path]) -> None:
+    for method in ("sft", "lora", "frozen", "joint"):
+        records = even_board(method, 0, 0.5)
+    letters = {row.method: row.letters for row in compute_board(records).rows}
+    assert letters == {"sft": "a", "lora": "a", "frozen": None, "joint": None}

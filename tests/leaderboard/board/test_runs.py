@@ -69,3 +69,14 @@ def test_a_changed_setting_that_the_settings_do_not_have_is_refused(
     write_record(record, path)
     with pytest.raises(RecordError, match="run: changes and settings differ in step_factor"):
         read_run(tmp_path, path, changed=True)
+
+
+@pytest.mark.parametrize(("only", "seeds"), [(None, [0, 1]), (("Toy-v0/sft/seed-1.json",), [1]), ((), [])])
+def test_of_the_records_that_are_named_no_other_is_read(
+    only: Any, seeds: list[int], make_record: Callable[..., Record], tmp_path: Path
+) -> None:
+    for seed in range(2):
+        record = make_record([[1.0, 0.0], [0.5, 1.0]], groups=(1, 1, 0), episodes=2, seed=seed, method="sft")
+        write_record(record, record_path(tmp_path, SCENARIO, "sft", seed))
+    kept, refused = read_runs(tmp_path, read_run, ALIKE, only)
+    assert ([run.seed for run in kept], refused) == (seeds, [])

@@ -49,3 +49,18 @@ def test_a_verification_whose_checks_are_no_list_counts_as_none(
         verification = verification_of(record)
         assert verification.tier == tier
         assert verification.notes == ((("tier", "replayed"),) if tier == "replayed" else ())
+
+
+def test_a_verification_of_other_bytes_or_with_an_edited_tier_counts_as_none(
+    add: Callable[..., Path],
+) -> None:
+    record = add()
+    values = {"tier": "recomputed", "record": hashlib.sha256(record.read_bytes()).hexdigest(), "checks": []}
+    path, whole = verification_path(record), verification_text(values)
+    path.write_text(whole, encoding="utf-8")
+    assert verification_of(record).tier == "recomputed"
+    path.write_text(whole.replace("recomputed", "retrained"), encoding="utf-8")
+    assert verification_of(record).tier == "self-reported"
+    path.write_text(whole, encoding="utf-8")
+    record.write_bytes(record.read_bytes() + b"\n")
+    assert verification_of(record).tier == "self-reported"

@@ -24,6 +24,7 @@ from clbench.jobs.job import Job
 from clbench.learning.method import Method
 from clbench.policy.policy import Policy
 from clbench.records.paths import record_name
+from clbench.records.reader import read_record
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.spec.registry import load_scenario
@@ -115,6 +116,22 @@ def test_another_version_of_clbench_excuses_no_other_outcome(mine: Path, honest:
     edit(mine, lambda values: flip(values, 0, 60))
     checks = verify(mine, "replayed", honest)
     assert {one.name: one.passed for one in checks}["episodes"] is False
+
+
+@pytest.mark.long
+def test_a_whole_run_that_ends_otherwise_when_it_is_repeated_takes_that_tier_away(
+    mine: Path, honest: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    claimed = {"tier": "retrained", "record": hashlib.sha256(mine.read_bytes()).hexdigest()}
+    tiers.verification_path(mine).write_text(tiers.verification_text(claimed), encoding="utf-8")
+    assert tiers.tier_of(mine) == "retrained"
+    again = read_record(mine)
+    again.costs.bytes_kept = 1
+    monkeypatch.setattr(verifier, "execute", lambda *_: again)
+    *_, last = verify(mine, "retrained", honest)
+    assert (last.name, last.passed) == ("whole run", False)
+    assert "costs (bytes_kept) differ" in last.found
+    assert tiers.tier_of(mine) == "replayed"
 
 
 @pytest.mark.long
