@@ -242,7 +242,7 @@ class Boundless(Method):
 def test_a_state_that_cannot_be_read_again_is_refused_when_it_is_written(
     stranger: Callable[[type[Method]], str],
 ) -> None:
-    message = r"failed in state\(\) after stage 0: .*best: a number that is not finite"
+    message = r"failed in state\(\) after stage 0: .*'best': a number that is not finite"
     with pytest.raises(MethodError, match=message):
         stage_policies(RunSpec(TINY.id, stranger(Boundless), seed=0).resolve())
 
