@@ -262,3 +262,13 @@ def test_success_at_the_start_counts_the_scored_episodes_of_the_retained_skills_
     success = [[1.0, 0.8, 0.1, 0.0, 0.2], [0.6, 0.9, 0.9, 0.2, 0.3], [0.5, 0.4, 0.3, 0.8, 0.1]]
     record = make_record(success, perturbed=[[0.1, 0.1], [0.5, 0.8], [0.4, 0.2]], complete=False)
     assert record.retained_at_start() == pytest.approx((1.0 + 0.8) / 2)
+
+
+def test_stages_that_are_dropped_leave_the_earlier_ones_whole(record: Record) -> None:
+    record.diagnostics = {"0": {"a": 1}, "1": {"a": 2}}
+    record.timing["stages"] = [{"evaluation": 1.0}, {"evaluation": 2.0}]  # of an agent, from stage 0
+    before = [row for row in record.episode_rows() if row.stage == 0]
+    record.drop_stages(1)
+    assert record.episode_rows() == before != []
+    assert [row.stage for row in record.answer_rows()] == [0]
+    assert (record.diagnostics, record.timing["stages"]) == ({"0": {"a": 1}}, [{"evaluation": 1.0}])
