@@ -36,11 +36,12 @@ class Grid(Generic[OneRow]):
     """Methods by division, those with the most scenarios first."""
 
 
-def grids(tables: Mapping[str, Sequence[OneRow]]) -> list[Grid[OneRow]]:
+def grids(tables: Mapping[str, Sequence[OneRow]], least: int = 1) -> list[Grid[OneRow]]:
     """Return the grids of the policies, the default one's first.
 
     Args:
         tables: Rows of each scenario and policy.
+        least: Fewest scenarios of a grid.
     """
     policies = sorted(
         {table_parts(name)[1] for name in tables}, key=lambda name: (name != DEFAULT_POLICY, name)
@@ -52,7 +53,7 @@ def grids(tables: Mapping[str, Sequence[OneRow]]) -> list[Grid[OneRow]]:
             for name, rows in tables.items()
             if table_parts(name)[1] == policy and len(competing(rows)) > 1
         }
-        if chosen:
+        if len(chosen) >= least:
             found.append(Grid(policy, tuple(chosen), tuple(_methods(chosen.values()))))
     return found
 

@@ -41,7 +41,7 @@ def markdown(board: Board, comparisons: Comparisons) -> str:
     by_scenario = tables_of(board.rows)
     return template(__file__, "leaderboard.md.jinja").render(
         board=board,
-        grids=[one for one in grids(by_scenario) if len(one.scenarios) > 1],
+        grids=grids(by_scenario, least=2),
         by_scenario=by_scenario,
         shown=shown,
         all_shown=_all_shown(by_scenario.values()),

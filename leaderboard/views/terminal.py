@@ -19,7 +19,7 @@ from clbench.scoring.metric import TIE
 from clbench.scoring.metrics import METRICS
 from clbench.spec.policies import DEFAULT_POLICY
 
-from ..board.grid import GridRow, grids
+from ..board.grid import Grid, GridRow, grids
 from ..board.summary import RANKED_BY, RowSummary, Summary, divisions_of, letters_of, tables_of
 from ..board.tiers import TIERS
 from .format import (
@@ -100,9 +100,8 @@ def terminal(table: Summary, width: int = 108, sort: str | None = None) -> Rende
     """
     # Text and not str: rich would obey markup in a stranger's words.
     parts: list[RenderableType] = []
-    tables: list[Sequence[RowSummary]] = []
-    for scenario, rows in tables_of(table.rows).items():
-        tables.append(rows)
+    tables = tables_of(table.rows)
+    for scenario, rows in tables.items():
         parts += _fitted(scenario, rows, _heads(rows, sort), width)
         sentences = (
             start_text(table.starts.get(scenario)),
@@ -112,15 +111,10 @@ def terminal(table: Summary, width: int = 108, sort: str | None = None) -> Rende
         )
         parts += [Text(sentence) for sentence in sentences if sentence]
         parts.append(Text())
-    for grid in grids(tables_of(table.rows)):
-        if len(grid.scenarios) > 1:
-            across = _grid_heads(grid.scenarios)
-            narrow = [head.title for head in reversed(across)]
-            policy = "" if grid.policy == DEFAULT_POLICY else f", {title_of(grid.policy)}"
-            title = f"All scenarios{policy}: {title_of(RANKED_BY)}"
-            parts += [*_fitted(title, grid.methods, across, width, narrow), Text()]
+    for grid in grids(tables, least=2):
+        parts += [*_across(grid, width), Text()]
     if parts:
-        columns = [one for rows in tables for one in _columns(rows, sort)]
+        columns = [one for rows in tables.values() for one in _columns(rows, sort)]
         heads = [one for one in columns if one.metric.higher_is_better is False]
         names = listed([*dict.fromkeys(one.title for one in heads), "cost", "bytes kept"])
         tried = TRIED if any(row.to_criterion for row in table.rows) else ""
@@ -130,6 +124,14 @@ def terminal(table: Summary, width: int = 108, sort: str | None = None) -> Rende
         parts.append(Text("Not shown", style="bold"))
         parts += [Text(f"  {entry}", overflow="fold") for entry in table.not_shown]
     return Group(*parts)
+
+
+def _across(grid: Grid[RowSummary], width: int) -> list[RenderableType]:
+    """Return the table of methods against scenarios; a narrow terminal loses the last scenarios first."""
+    policy = "" if grid.policy == DEFAULT_POLICY else f", {title_of(grid.policy)}"
+    heads = _grid_heads(grid.scenarios)
+    dropped_first = [head.title for head in reversed(heads)]
+    return _fitted(f"All scenarios{policy}: {title_of(RANKED_BY)}", grid.methods, heads, width, dropped_first)
 
 
 def _fitted(
