@@ -137,9 +137,10 @@ def _make(folder: Path, manifest: Mapping[str, Any], make: Callable[[Path], None
         hashes = _file_hashes(partial)
         text = json.dumps({**manifest, "files": hashes}, indent=1)
         (partial / MANIFEST).write_text(text, encoding="utf-8")
+        mode = (partial / MANIFEST).stat().st_mode
         with suppress(PermissionError):  # some file systems have no modes
             for name in hashes:  # safetensors lets only the owner read its files, whatever the umask allows
-                (partial / name).chmod((partial / MANIFEST).stat().st_mode)
+                (partial / name).chmod(mode)
         lease.check()
         if folder.exists():
             folder.rename(partial.with_suffix(".old"))

@@ -46,9 +46,10 @@ def check_state(state: Any) -> None:
                 raise StateError("dense tensors", f"a sparse one, {name!r}; store {name}.to_dense()")
         elif value is None or isinstance(value, str | float | int):
             try:
+                check_json({name: None}, "an entry")
                 check_json(json.loads(json.dumps(value)), repr(name))
             except StrictJSONError as error:
-                expected = "finite numbers and short texts (a tensor may hold any number)"
+                expected = "finite numbers, short texts and short names (a tensor may hold any number)"
                 raise StateError(expected, str(error).removesuffix(".")) from error
         else:
             expected = "a flat dictionary of tensors, strings, numbers, Booleans and None"
@@ -69,9 +70,7 @@ def write_state(folder: Path, state: MethodState) -> None:
     copies = {name: value.detach().clone().contiguous() for name, value in tensors.items()}
     save_file(copies, folder / "method.safetensors")
     values = {name: value for name, value in state.items() if name not in tensors}
-    text = json.dumps(values)
-    check_json(json.loads(text))  # refuse here what reading the file would refuse, such as a long name
-    (folder / "method.json").write_text(text, encoding="utf-8")
+    (folder / "method.json").write_text(json.dumps(values), encoding="utf-8")
 
 
 def read_state(folder: Path, device: torch.device | str = "cpu") -> MethodState:

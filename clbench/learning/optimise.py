@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import torch
@@ -60,6 +60,8 @@ def learning_rate_factor(step: int, steps: int) -> float:
 def deterministic(device: str = "cpu") -> Iterator[None]:
     """Use one thread and deterministic kernels in the block, so that a computation repeats bit for bit.
 
+    Matrices of float32 are multiplied in float32, although the program may allow TF32 or bfloat16 instead.
+
     Raises:
         InputError: PyTorch's default dtype is not float32.
     """
@@ -77,10 +79,28 @@ def deterministic(device: str = "cpu") -> Iterator[None]:
     torch.set_num_threads(1)
     torch.use_deterministic_algorithms(True)
     try:
-        yield
+        with _full_precision():
+            yield
     finally:
         torch.set_num_threads(threads)
         torch.use_deterministic_algorithms(algorithms, warn_only=warn_only)
+
+
+@contextmanager
+def _full_precision() -> Iterator[None]:
+    products = (torch.backends.cuda.matmul, torch.backends.mkldnn.matmul)  # type: ignore[attr-defined]
+    precisions = [product.fp32_precision for product in products]
+    overall = None
+    with suppress(RuntimeError):  # cannot be read once a program has set one of the two
+        overall = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("highest")
+    try:
+        yield
+    finally:
+        if overall is not None:
+            torch.set_float32_matmul_precision(overall)
+        for product, precision in zip(products, precisions, strict=True):
+            product.fp32_precision = precision
 
 
 @contextmanager

@@ -40,9 +40,10 @@ SETTINGS: Mapping[str, _Setting] = {
         torch.are_deterministic_algorithms_enabled,
         torch.use_deterministic_algorithms,
     ),
-    "torch.get_float32_matmul_precision()": (
-        torch.get_float32_matmul_precision,
-        torch.set_float32_matmul_precision,
+    # torch.get_float32_matmul_precision() raises an error after this was set
+    "torch.backends.cuda.matmul.fp32_precision": (
+        lambda: torch.backends.cuda.matmul.fp32_precision,
+        lambda value: setattr(torch.backends.cuda.matmul, "fp32_precision", value),
     ),
     "os.environ": (lambda: dict(os.environ), lambda value: _fill(os.environ, value)),
     "os.getcwd()": (os.getcwd, os.chdir),

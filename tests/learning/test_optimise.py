@@ -137,6 +137,25 @@ def test_the_deterministic_block_restores_what_was_set(warn_only: bool) -> None:
         torch.use_deterministic_algorithms(False)
 
 
+@pytest.mark.parametrize("place", [torch, torch.backends.cuda.matmul], ids=["everywhere", "on cuda"])
+def test_the_deterministic_block_multiplies_in_float32_although_the_program_allows_less(place: Any) -> None:
+    matmul = torch.backends.cuda.matmul
+    before = matmul.fp32_precision
+    try:
+        if place is torch:
+            torch.set_float32_matmul_precision("high")
+        else:
+            matmul.fp32_precision = "tf32"
+        with deterministic():
+            assert (torch.get_float32_matmul_precision(), matmul.fp32_precision) == ("highest", "ieee")
+        assert matmul.fp32_precision == "tf32"
+        assert place is not torch or torch.get_float32_matmul_precision() == "high"
+    finally:
+        torch.set_float32_matmul_precision("highest")
+        matmul.fp32_precision = before
+    assert torch.get_float32_matmul_precision() == "highest"
+
+
 def test_the_learning_rate_can_change_at_every_step_once_the_gradient_is_known() -> None:
     weight = nn.Parameter(torch.zeros(1))
     seen: list[tuple[float, int, bool]] = []

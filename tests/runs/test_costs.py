@@ -140,6 +140,14 @@ class Silent(Method):
 
 
 @dataclasses.dataclass
+class Wordy(Method):
+    """Has a state with a name that no file of a state may have."""
+
+    def state(self) -> MethodState:
+        return {"w" * 201: 1}
+
+
+@dataclasses.dataclass
 class Greedy(Method):
     """Draws a second batch of the target from its third step on."""
 
@@ -263,6 +271,11 @@ def test_a_mask_that_no_checkpoint_holds_need_not_be_finite(
         (Forgetful, "load_state() after stage 0", "load_state() must give a new policy the parameters and "),
         (Listing, "state() after stage 0", "Booleans and None, not a list, 'losses'."),
         (Silent, "state() after stage 0", "state() must return a dictionary, not NoneType."),
+        (
+            Wordy,
+            "state() after stage 0",
+            "short names (a tensor may hold any number), not an entry: a name of 201",
+        ),
         (Endless, "prepare", "The buffer mask is not finite after prepare()."),
         (
             Greedy,

@@ -241,6 +241,14 @@ class Careless(Method):
 
 
 @dataclasses.dataclass
+class Approximate(Method):
+    """Allows TF32."""
+
+    def prepare(self, policy: Policy, prior: Prior) -> None:
+        torch.backends.cuda.matmul.fp32_precision = "tf32"
+
+
+@dataclasses.dataclass
 class Exports(Method):
     """Sets a variable of the environment."""
 
@@ -343,6 +351,7 @@ FAULTS_OF_STATE: list[tuple[Any, str, str, str]] = [
     (Doubles, "global state", "as it was", "torch.get_default_dtype() is torch.float64"),
     (Blind, "global state", "as it was", "after end_task() torch.is_grad_enabled() is False"),
     (Careless, "global state", "as it was", "are_deterministic_algorithms_enabled() is False"),
+    (Approximate, "global state", "as it was", "torch.backends.cuda.matmul.fp32_precision is tf32"),
     (Exports, "global state", "as it was", "os.environ differs in LIVELY"),
     (Moves, "global state", "as it was", "os.getcwd() is /"),
     (Paths, "global state", "as it was", "sys.path differs in /nowhere"),
