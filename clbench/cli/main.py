@@ -63,8 +63,8 @@ USAGES = {
     "tune": "SCENARIO [METHODS...]",
     "verify": "PATHS...",
     "scenario-card": "[SCENARIOS...]",
-    "export": "SCENARIO [TASKS...]",
-    "measure": "SCENARIO [TASKS...]",
+    "demonstrations export": "SCENARIO [TASKS...]",
+    "experts measure": "SCENARIO [TASKS...]",
 }
 """Arguments in the first line of a command's help, where Cyclopts would show [ARGS...]."""
 
@@ -136,9 +136,8 @@ def _app(name: str, text: str | None, commands: dict[Group, dict[str, str]]) -> 
     )
     for group, members in commands.items():
         for number, (command, entry_point) in enumerate(members.items()):
-            arguments = USAGES.get(command)
-            program = name if name == "clbench" else f"clbench {name}"
-            usage = f"Usage: {program} {command} [OPTIONS] {arguments}" if arguments else None
+            words = command if name == "clbench" else f"{name} {command}"
+            usage = f"Usage: clbench {words} [OPTIONS] {USAGES[words]}" if words in USAGES else None
             made.command(entry_point, name=command, group=group, sort_key=number, usage=usage)
     return made
 

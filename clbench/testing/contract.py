@@ -30,7 +30,7 @@ from clbench.learning.hooks import (
     uncalled_functions,
 )
 from clbench.learning.method import Method
-from clbench.learning.prior import Access
+from clbench.learning.prior import Access, Uses
 from clbench.learning.registry import read_changes
 from clbench.policy.policy import ABILITIES
 from clbench.runs.spec import is_setting
@@ -64,7 +64,7 @@ method that moves least, `finch`, gains 2.1."""
 SLOWER = 0.3
 """Factor of the learning rate in a run that must leave other weights. Tuning tries it for every method."""
 
-PRIOR = ("demonstrations", "questions")
+PRIOR = [one.name for one in dataclasses.fields(Uses) if one.name != "reference"]
 """Kinds of prior data, by the fields of `Uses`."""
 
 

@@ -42,6 +42,7 @@ from .summary import (
     DIVISIONS,
     ELSEWHERE,
     RANKED_BY,
+    REFERENCE,
     RowSummary,
     Summary,
     competing,
@@ -149,7 +150,7 @@ def _scenario_rows(runs: list[Run]) -> list[Row]:
         members = {method: runs for method, runs in by_method.items() if runs[0].division == division}
         estimates = {method: _estimates(method, by_method) for method in members}
         scores = {method: _scores(runs) for method, runs in members.items()}
-        letters = groups(RANKED_BY, scores if division != "reference" else {})
+        letters = groups(RANKED_BY, scores if division != REFERENCE else {})
         finals = {method: estimates[method][RANKED_BY].value for method in members}
         heights = _heights(finals, scores, _scores(by_method.get(BASELINE, ())))
         order = sorted(members, key=lambda method: (_falling(heights[method]), method))

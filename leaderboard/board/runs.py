@@ -24,11 +24,14 @@ from clbench.spec.identifiers import built_in_methods
 from clbench.spec.protocol import FIRST_TUNING_SEED
 from clbench.spec.scenario import balanced_order, target_order
 
-from .summary import NotShown
+from .summary import REFERENCE, NotShown
 from .tiers import verification_of
 
 ACCESS = ("never", "prepare", "throughout")
 """Values of `Record.run.uses`: when a method may use prior data."""
+
+PRIOR = ("demonstrations", "questions")
+"""Kinds of prior data in `Record.run.uses`; the first that a method may use names its division."""
 
 LONGEST_REASON = 300
 """Characters of a reason that are shown; an error's message may be a page long."""
@@ -215,7 +218,6 @@ def division_of(uses: dict[str, Any]) -> str:
     Raises:
         RecordError: `uses` is not a valid declaration.
     """
-    kinds = ("demonstrations", "questions")
     if "external" in uses:
         if uses != EXTERNAL_USES:
             raise RecordError("run: uses of a policy that was fine-tuned elsewhere must hold nothing else.")
@@ -224,16 +226,16 @@ def division_of(uses: dict[str, Any]) -> str:
         if uses != ONLINE_USES:
             raise RecordError("run: uses of an agent that learned online must hold nothing else.")
         return "online"
-    if set(uses) != {*kinds, "reference"} or any(uses[kind] not in ACCESS for kind in kinds):
+    if set(uses) != {*PRIOR, "reference"} or any(uses[kind] not in ACCESS for kind in PRIOR):
         raise RecordError(
-            f"run: uses must say when demonstrations and questions are used, {' or '.join(ACCESS)}, and "
+            f"run: uses must say when {' and '.join(PRIOR)} are used, {' or '.join(ACCESS)}, and "
             "whether the method is a reference."
         )
     if type(uses["reference"]) is not bool:
         raise RecordError("run: reference of uses must be true or false.")
     if uses["reference"]:
-        return "reference"
-    used = [kind for kind in kinds if uses[kind] != "never"]
+        return REFERENCE
+    used = [kind for kind in PRIOR if uses[kind] != "never"]
     return f"prior {used[0]}" if used else "prior-data-free"
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Protocol, TypeVar
 
 from clbench.scoring.intervals import Estimate
@@ -12,23 +12,26 @@ from clbench.scoring.metrics import METRICS
 
 from .agreement import Concordance
 
-DIVISIONS = ("prior-data-free", "prior questions", "prior demonstrations", "online", "external", "reference")
-"""Divisions in the order of the table: the first three by the prior data that a method may use; "online" for
-agents of other programs, which learned by trial, and "external" for policies that were fine-tuned elsewhere,
-on data that their authors declare: no method is compared with either; "reference" for references, which do
-not compete."""
-
-ELSEWHERE = ("online", "external")
-"""Divisions of policies that another program trained: there is nothing to run again."""
-
-METHODS = DIVISIONS[:3]
-"""Divisions of methods, which start from the same policy and learn from the same demonstrations."""
-
-WITHOUT_DEMONSTRATIONS = METHODS[:2]
+WITHOUT_DEMONSTRATIONS = ("prior-data-free", "prior questions")
 """Divisions of methods that may not read prior demonstrations."""
 
-WITH_DEMONSTRATIONS = METHODS[2:]
+WITH_DEMONSTRATIONS = ("prior demonstrations",)
 """Divisions of methods that may read prior demonstrations."""
+
+METHODS = (*WITHOUT_DEMONSTRATIONS, *WITH_DEMONSTRATIONS)
+"""Divisions of methods, which start from the same policy and learn from the same demonstrations."""
+
+ELSEWHERE = ("online", "external")
+"""Divisions of policies that another program trained, so that there is nothing to run again: agents, which
+learned by trial, and policies that were fine-tuned on data that their authors declare. No method is compared
+with either. Each has a page of its name in `docs/guide`, and an actor in `clbench verify`."""
+
+REFERENCE = "reference"
+"""Division of references, which do not compete."""
+
+DIVISIONS = (*METHODS, *ELSEWHERE, REFERENCE)
+"""Divisions in the order of the table. Each has a rule in `RULES`, a shape in `SHAPES`, and a colour in
+`PALETTE` and the style of the page."""
 
 COSTS = {
     "steps": "optimiser_steps",
@@ -135,7 +138,7 @@ class Summary:
         )
 
 
-_PLAIN = ("scenario", "method", "division", "letters", "tier", "to_criterion", "order_sensitivity", "tried")
+_PLAIN = [one.name for one in fields(RowSummary) if one.name not in ("seeds", "estimates", "costs")]
 """Fields of a row that are JSON as they are."""
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from clbench.scoring.reading import is_number
 
+from ..board.runs import PRIOR
 from .arms import (
     ARMS,
     arms_that_count,
@@ -403,7 +404,7 @@ def costs_nothing(evidence: Evidence) -> Finding:
     reads = any(
         run.record.run.uses.get(kind, "never") != "never"
         for run in evidence.runs.get("consft", {}).values()
-        for kind in ("demonstrations", "questions")
+        for kind in PRIOR
     )
     more = reads or bytes_kept.value > bytes_of_sft.value or added.value > added_by_sft.value
     unknown = [one for one in (bytes_kept, bytes_of_sft, added, added_by_sft) if math.isnan(one.value)]

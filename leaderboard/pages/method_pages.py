@@ -20,6 +20,7 @@ from clbench.spec.references import BASELINE, FROZEN
 from ..board.commands import commands_of, run_command
 from ..board.frontier import FACTOR
 from ..board.rows import Row
+from ..board.runs import PRIOR
 from ..board.summary import DIVISIONS, grouped
 from ..claims.aegis import SHARES
 from ..claims.evidence import SHARE, Evidence
@@ -101,17 +102,14 @@ def _contents(methods: Sequence[Description]) -> str:
 
 def _page(method: Description, sources: Sources) -> str:
     """Return the page of one method."""
-    text, uses, scenario = method.text, method.cls.uses, sources.evidence.scenario
+    text, scenario = method.text, sources.evidence.scenario
     papers = arxiv_ids(" ".join((text.idea, *text.rule)))
     names = [name for name in dict.fromkeys((method.name, *COMPARISONS)) if name in sources.rows]
     return template(__file__, "method.md.jinja").render(
         method=method,
         papers=papers,
         other_papers=[one for one in arxiv_ids(" ".join(text.details)) if one not in papers],
-        uses=[
-            USED[when].format(kind)
-            for kind, when in (("demonstrations", uses.demonstrations), ("questions", uses.questions))
-        ],
+        uses=[USED[getattr(method.cls.uses, kind)].format(kind) for kind in PRIOR],
         costs=sources.rows[method.name].costs if method.name in sources.rows else {},
         diagnostics=_diagnostics(method, sources),
         scenario=scenario,

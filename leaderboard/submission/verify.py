@@ -11,7 +11,7 @@ import hashlib
 import json
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, is_dataclass, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -48,18 +48,10 @@ from ..views.files import write_all
 from .replay import replay
 from .subject import Check, Request, Subject, some
 
-PARTS = (
-    "run",
-    "scenario",
-    "episodes",
-    "answers",
-    "policy",
-    "checks",
-    "relearning",
-    "costs",
-    "diagnostics",
+PARTS = tuple(
+    one.name for one in fields(Record) if one.name not in ("status", "fingerprint", "timing", "error")
 )
-"""Parts that two records of one run share to the last bit."""
+"""Parts that two records of one run share to the last bit: all but what tells how and where it was made."""
 
 _ACTORS = {"online": "an agent that learned online", "external": "a policy served from elsewhere"}
 """What acted in the runs of `ELSEWHERE`."""

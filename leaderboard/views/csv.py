@@ -24,6 +24,6 @@ def csv_text(table: Summary) -> str:
 def _field(column: str, value: str | float | None) -> str:
     if isinstance(value, str):
         return value
-    counts = column in ("seeds", "settings_tried", *COSTS)  # or means of counts
+    counts = isinstance(value, int) or column in COSTS  # or means of counts
     whole = counts and value is not None and float(value).is_integer()
     return number_text(value, ".0f" if whole else ".4f", "")

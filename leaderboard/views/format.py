@@ -20,7 +20,7 @@ from clbench.spec.policies import DEFAULT_POLICY
 from ..board.agreement import Concordance, Prediction, RankCorrelation
 from ..board.certainty import TiedGain, side_of_zero
 from ..board.rows import Row, standing_of
-from ..board.summary import DIVISIONS, GAIN, RowSummary
+from ..board.summary import GAIN, REFERENCE, RowSummary
 from ..board.tiers import TIERS
 
 FIXED = (
@@ -253,7 +253,7 @@ def standing_text(row: Row, rows: Iterable[Row], named: int | None = None) -> st
     """
     standing = standing_of(row, rows)
     if standing is None:
-        return "a reference does not compete" if row.division == DIVISIONS[-1] else "no final average"
+        return "a reference does not compete" if row.division == REFERENCE else "no final average"
     shown = list(standing.alike[:named])
     if len(standing.alike) > len(shown):
         shown.append(f"{len(standing.alike) - len(shown)} more")

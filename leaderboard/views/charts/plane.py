@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from ...board.summary import DIVISIONS, RowSummary
+from ...board.summary import DIVISIONS, ELSEWHERE, METHODS, RowSummary
 from .axes import LEARNED, SKILLS, Axis, Quantity
 from .labels import LONGEST, Mark, place
 from .vega import FONT, SHAPES, SYSTEM_FONT, Size, Spec, colour, heading, layer, specification, subtitle
@@ -120,7 +120,7 @@ class Plane:
         self.across, self.up = Axis.of(across, rows), Axis.of(up, rows)
         inside = [row for row in rows if self._holds(row)]
         self.points = [self._point(row, (anchors or {}).get(row.method, "")) for row in inside]
-        self.corners = [corner for division in DIVISIONS[:-1] for corner in self._front(division)]
+        self.corners = [corner for division in (*METHODS, *ELSEWHERE) for corner in self._front(division)]
         self.outside = [row for row in rows if not self._holds(row)]
 
     @property

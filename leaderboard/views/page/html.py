@@ -18,6 +18,7 @@ from markupsafe import Markup
 from clbench.base.text import counted, printable
 from clbench.records.paths import table_parts
 from clbench.spec.identifiers import built_in_methods, folder_name
+from clbench.spec.references import BASELINE
 
 from ...board.rows import Board
 from ...board.summary import DIVISIONS, ELSEWHERE
@@ -260,7 +261,7 @@ def _scenario_data(one: ScenarioView) -> dict[str, Any]:
         **extra,
         "to_criterion": one.to_criterion,
         "metrics": [[title_of(metric.name), metric.description, metric.missing] for metric in one.others],
-        "sft": anchors.get("sft"),
+        "sft": anchors.get(BASELINE),
         "steps": steps,
         "targets": one.tasks["target"],
         "run": along_a_run(titles, length),

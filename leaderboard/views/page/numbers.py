@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from clbench.scoring.intervals import Estimate
+from clbench.scoring.metric import DIFFERENCE
 
 from ...board.rows import Row
 from ..format import Column, bytes_text, number_text, times_text
@@ -37,7 +38,7 @@ def number(one: Estimate, column: Column) -> Number:
         return Number(text, order, "without an interval")
     ends = [round(100 * min(max(round(end, 9), 0.0), 1.0)) for end in (one.low, one.value, one.high)]
     note = f"95 % interval from {number_text(one.low, form)} to {number_text(one.high, form)}"
-    has_bar = (metric.low, metric.high) == (0, 1) and not metric.units.startswith("difference")
+    has_bar = (metric.low, metric.high) == (0, 1) and metric.units != DIFFERENCE
     return Number(text, order, note, tuple(ends) if has_bar else ())
 
 

@@ -18,6 +18,7 @@ from clbench.scoring.scores import rates_of
 from clbench.spec.identifiers import built_in_methods
 
 from ...board.rows import Row, standing_of
+from ...board.runs import PRIOR
 from ...board.summary import DIVISIONS, ELSEWHERE, RANKED_BY, letters_of
 from ..charts.curves import estimated, retained_curve, target_curves
 from ..charts.vega import finite, rounded
@@ -166,7 +167,7 @@ class RowView:
     def settings(self) -> list[Entry]:
         """Hyper-parameters, and the prior data that its method may use."""
         run = self.row.runs[0].record.run
-        uses = {f"prior {kind}": run.uses.get(kind, "not known") for kind in ("demonstrations", "questions")}
+        uses = {f"prior {kind}": run.uses.get(kind, "not known") for kind in PRIOR}
         return [*flat(run.settings), *flat(uses)]
 
     @property

@@ -13,7 +13,7 @@ import pytest
 from helpers import sealed
 
 from clbench.records.paths import record_path
-from clbench.records.record import Record
+from clbench.records.record import SCHEMA, Record
 from clbench.records.writer import write_record
 
 SCENARIO = "clbench/Toy-v0"
@@ -119,12 +119,12 @@ NAMES = [
 ]
 
 FIELDS = [
-    ("schema", 1, "a whole number from 2 to 5"),
+    ("schema", 1, f"a whole number from 2 to {SCHEMA}"),
     ("schema", 2, "run: order must be above 0 in schema 2"),
-    ("schema", 6, "has schema 6, which is newer than 5: update clbench"),
-    ("schema", "3", "a whole number from 2 to 5"),
-    ("score", 0.99, "No field of a record of schema 5 is called 'score'"),
-    ("costs", ABSENT, "a record of schema 5: costs is missing"),
+    ("schema", SCHEMA + 1, f"has schema {SCHEMA + 1}, which is newer than {SCHEMA}: update clbench"),
+    ("schema", "3", f"a whole number from 2 to {SCHEMA}"),
+    ("score", 0.99, f"No field of a record of schema {SCHEMA} is called 'score'"),
+    ("costs", ABSENT, f"a record of schema {SCHEMA}: costs is missing"),
     ("costs.bytes_kept", -1, "costs: bytes_kept must not be below 0"),
     ("costs.optimiser_steps", "few", "costs: optimiser_steps must be a whole number"),
     ("costs.parametres", 1, "No field of costs is called 'parametres'. Did you mean 'parameters'?"),
@@ -245,7 +245,7 @@ FILES = [
     (linked, "is a symbolic link"),
     (piped, "is not a regular file"),
     (replaced_by_folder, "cannot be read (Is a directory)"),
-    (replaced('"schema": 5', '"schema": 5, "schema": 5'), "the name 'schema' is there twice"),
+    (replaced('"schema": ', '"schema": 5, "schema": '), "the name 'schema' is there twice"),
     (replaced('"seed": 0', '"seed": 0, "seed": 1'), "the name 'seed' is there twice"),
     (replaced('"seed": 0', '"seed": ' + "9" * 5000), "cannot be read as JSON"),
     (replaced("0.5", "NaN"), "NaN is not a JSON number"),

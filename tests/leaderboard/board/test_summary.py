@@ -28,6 +28,7 @@ def _row(method: str, estimates: dict[str, Estimate], seeds: tuple[int, ...] = (
         "estimates": estimates,
         "costs": {"steps": 3.0},
         "order_sensitivity": None,
+        "tried": 7,
     }
     return RowSummary(**{**given, **fields})
 

@@ -10,6 +10,7 @@ import pytest
 from verification import TOY, Edit, edit, failures, flip, verify
 
 from clbench.records.reader import home_of, read_record
+from clbench.records.record import SCHEMA
 from clbench.runs.spec import RunSpec
 
 tiers = importlib.import_module("clbench.leaderboard.board.tiers")
@@ -178,7 +179,7 @@ FORGERIES = {
     ),
     "no definition": Forgery(
         "recomputed",
-        "a record of schema 5: fingerprint.definition must be an object",
+        f"a record of schema {SCHEMA}: fingerprint.definition must be an object",
         lambda values: values["fingerprint"].pop("definition"),
     ),
     "a larger budget": Forgery(

@@ -53,6 +53,14 @@ def test_a_narrow_terminal_loses_whole_columns_and_says_which(
     assert "…" not in printed
 
 
+@pytest.mark.parametrize("kind", ["FIXED", "TO_CRITERION"])
+def test_a_narrow_terminal_can_lose_every_metric_but_the_final_average(kind: str) -> None:
+    form = "clbench.leaderboard.views.format"
+    names, title = resolve(f"{form}:FITTING_{kind}"), resolve(f"{form}:column_title")
+    stay = {title(name, to_criterion=kind == "TO_CRITERION") for name in names}
+    assert stay - set(resolve("clbench.leaderboard.views.terminal:DROPPED_FIRST")) == {"final average"}
+
+
 def test_the_best_of_a_division_is_bold_and_a_lone_row_is_not(
     four_methods: Path, add_full: Callable[..., Path], matrix: Any
 ) -> None:
