@@ -233,7 +233,7 @@ def _taus(rows: Sequence[Row]) -> dict[str, float]:
     """Return Kendall's tau between the final average and each of `DEFINITIONS` that the rows have."""
     found = {}
     for metric in DEFINITIONS:
-        one, other = _common(rows, rows, RANKED_BY, metric)
+        one, other = _common(rows, rows, metric)
         tau = float(kendall_tau(one.mean(axis=1), other.mean(axis=1))) if len(one) >= LEAST_ROWS else np.nan
         if np.isfinite(tau):
             found[metric] = tau
@@ -272,27 +272,24 @@ def _shares_of_variance(rows: Sequence[Row]) -> tuple[str, str]:
 
 def _between(rows: Sequence[Row], others: Sequence[Row]) -> RankCorrelation | None:
     """Return the agreement of two scenarios on the order of the methods that both have."""
-    one, other = _common(rows, others, RANKED_BY, RANKED_BY)
+    one, other = _common(rows, others, RANKED_BY)
     return agreement_between(one, other) if len(one) else None
 
 
-def _common(
-    rows: Sequence[Row], others: Sequence[Row], metric: str, other_metric: str
-) -> tuple[Array, Array]:
+def _common(rows: Sequence[Row], others: Sequence[Row], metric: str) -> tuple[Array, Array]:
     """Return two metrics of the methods that both lists have, higher is better, (methods, seeds).
 
     Both arrays are empty if there is no such method.
 
     Args:
-        rows: Rows of a scenario.
+        rows: Rows of a scenario, of which the final average is returned.
         others: Rows of another scenario, or of the same one.
-        metric: Metric of the first rows.
-        other_metric: Metric of the others.
+        metric: Metric of the others.
     """
-    ours, theirs = values_by_seed(rows, metric), values_by_seed(others, other_metric)
+    ours, theirs = values_by_seed(rows, RANKED_BY), values_by_seed(others, metric)
     both = [method for method in ours if method in theirs]
     one, other = (
         (1.0 if load_metric(name).higher_is_better else -1.0) * np.array([values[method] for method in both])
-        for name, values in ((metric, ours), (other_metric, theirs))
+        for name, values in ((RANKED_BY, ours), (metric, theirs))
     )
     return one, other

@@ -161,19 +161,6 @@ class Greedy(Method):
         return policy.parameters()
 
 
-@dataclasses.dataclass
-class Hoarding(Method):
-    """Keeps the sources of a stage for the next one."""
-
-    def start_task(self, policy: Policy, stage: Stage) -> Any:
-        SOURCES.append(stage.target)
-        SOURCES[0].sample(1)
-        return policy.parameters()
-
-
-SOURCES: list[Any] = []
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(("method", "more"), [(Consolidating, 2 * 7), (Preparing, 5)])
 def test_steps_outside_of_the_loop_are_counted(
@@ -282,7 +269,6 @@ def test_a_mask_that_no_checkpoint_holds_need_not_be_finite(
             "loss() of stage 1 (right)",
             f"draws {2 * BATCH} samples of the target in a step: the budget of every method is {BATCH}, the",
         ),
-        (Hoarding, "start_task() of stage 2 (down)", "draws from data after the hooks that received it"),
     ],
 )
 def test_a_method_is_told_what_it_did_wrong(
@@ -292,7 +278,6 @@ def test_a_method_is_told_what_it_did_wrong(
     stranger: Callable[[type[Method]], str],
     tmp_path: Path,
 ) -> None:
-    SOURCES.clear()
     record = execute(RunSpec(TINY.id, stranger(method), seed=0), tmp_path)
     assert record.error is not None
     assert record.error["where"] == where

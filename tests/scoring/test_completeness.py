@@ -85,18 +85,19 @@ def test_a_policy_that_was_trained_elsewhere_has_neither_answers_nor_changes_of_
 
 
 @pytest.mark.parametrize(
-    ("step", "task", "number", "words"),
+    ("step", "task", "split", "number"),
     [
-        (100, "target_0", 9, "the test episode 9 of target_0 is missing at stage 1, step 100"),
-        (400, "unseen_0", 0, "the test episode 0 of unseen_0 is missing at stage 1, step 400"),
+        (100, "target_0", "test", 9),
+        (400, "unseen_0", "test", 0),
+        (400, "target_0", "validation", 9),
     ],
 )
 def test_an_episode_that_is_left_out_is_named(
-    step: int, task: str, number: int, words: str, record: Record
+    step: int, task: str, split: str, number: int, record: Record
 ) -> None:
-    lost = (1, step, task, "test", number)
+    lost = (1, step, task, split, number)
     record.episodes = without(record.episodes, lambda row: row[:5] != lost)
-    refused(record, words)
+    refused(record, f"the {split} episode {number} of {task} is missing at stage 1, step {step}")
 
 
 def test_an_episode_that_is_not_planned_at_its_point_is_named(record: Record) -> None:

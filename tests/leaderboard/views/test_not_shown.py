@@ -16,7 +16,7 @@ from helpers import sealed, set_in
 from clbench.base.entry_points import resolve
 from clbench.records.paths import record_path
 from clbench.records.pinned import pinned
-from clbench.records.record import Record
+from clbench.records.record import SCHEMA, Record
 from clbench.records.writer import write_record
 
 ASKS = {"demonstrations": "never", "questions": "prepare", "reference": False}
@@ -45,7 +45,8 @@ def test_a_record_that_is_not_of_its_schema_is_listed_and_hides_no_other(
 ) -> None:
     before = load(four_methods)
     path = add_full("old", 0)
-    path.write_text(path.read_text(encoding="utf-8").replace('"schema": 5', '"schema": 2'), encoding="utf-8")
+    older = path.read_text(encoding="utf-8").replace(f'"schema": {SCHEMA}', '"schema": 2')
+    path.write_text(older, encoding="utf-8")
     pandas.testing.assert_frame_equal(load(four_methods), before)
     for text in shown():
         assert "old/seed-0.json: run: order must be above 0 in schema 2" in flat(text)
@@ -54,11 +55,6 @@ def test_a_record_that_is_not_of_its_schema_is_listed_and_hides_no_other(
 def fail(record: Record) -> None:
     record.status = "failed"
     record.error = {"where": "loss", "type": "ValueError", "message": "no | [bold]way\n", "traceback": ""}
-
-
-def cut_answers(record: Record) -> None:
-    record.answers = {name: column[:-1] for name, column in record.answers.items()}
-    record.answers["kind"][-1] = "right"
 
 
 def lose(record: Record, lost: Callable[..., bool]) -> None:
@@ -84,12 +80,9 @@ def lose_validation_episode(record: Record) -> None:
         (set_in("run", "method", "[red]x[/red] | `y` | <b>"), "cannot be the name of a method"),
         (set_in("run", "method", "x\n| best | 1.00 |"), "cannot be the name of a method"),
         (set_in("run", "method", "\x1b[31mred\u202e\ud800"), "cannot be the name of a method"),
-        (set_in("run", "method", None), "run: method must be a string, not null."),
         (set_in("run", "scenario", "../Toy\n"), "cannot be the id of a scenario"),
         (set_in("run", "scenario", "clbench/Toy-v9"), "was run"),
-        (set_in("run", "seed", "0"), 'run: seed must be a whole number, not "0".'),
         (set_in("run", "uses", {}), "uses must say"),
-        (set_in("scenario", "retained", "all"), 'scenario: retained must be a list, not "all".'),
         (
             lambda record: record.scenario.budget.update(adaptation_steps=9),
             "budget (adaptation_steps)",
@@ -97,16 +90,12 @@ def lose_validation_episode(record: Record) -> None:
         (set_in("scenario", "target", ["target_1", "target_0"]), "is missing at stage 1, step 100"),
         (set_in("fingerprint", "rollouts", {"toy:world": "4567"}), "rollouts of toy:world differ"),
         (set_in("fingerprint", "rollouts", None), "rollouts of all worlds differ"),
-        (set_in("episodes", "success", [0.5]), "different lengths"),
-        (cut_answers, "other questions were asked than before any target"),
         (lose_curve_episode, "the test episode 9 of skill_0 (and 3 others) is missing at stage 1, step 100"),
         (lose_validation_episode, "the validation episode 9 of target_0 is missing at stage 1"),
-        (set_in("policy", "step", []), "the columns of policy have different lengths"),
         (
             set_in("run", "split", "validation"),
             "it is a tuning run: settings may have been chosen on its episodes.",
         ),
-        (set_in("run", "split", "all"), "split must be test or validation"),
         (set_in("run", "settings", {"strength": 2}), "settings do not match most seeds: strength"),
         (set_in("run", "device", "cuda"), "settings do not match most seeds: device"),
     ],
@@ -168,7 +157,7 @@ def test_a_record_of_another_definition_of_a_scenario_of_the_project_is_not_show
     add_full("sft", 4, edit=on_arm, scenario="clbench/Fetch-v1", place="Fetch-v1/sft/seed-4.json")
     for text in shown():
         words = "fingerprint.definition must be an object, the parts of its scenario."
-        assert f"Fetch-v1/sft/seed-0.json: a record of schema 5: {words}" in flat(text)
+        assert f"Fetch-v1/sft/seed-0.json: a record of schema {SCHEMA}: {words}" in flat(text)
         assert "Fetch-v1/sft/seed-1.json" not in flat(text)
         words = "it was made with another definition of clbench/Fetch-v1"
         assert f"Fetch-v1/sft/seed-2.json: {words}: task press, questions differ." in flat(text)
