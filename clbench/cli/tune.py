@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -33,7 +34,7 @@ from clbench.cli.arguments import (
 from clbench.cli.runs import do_runs
 from clbench.jobs.folders import check_folders
 from clbench.records.paths import TUNING, table_name
-from clbench.spec.identifiers import without_module
+from clbench.spec.identifiers import built_in_methods, without_module
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.protocol import FIRST_TUNING_SEED
 from clbench.spec.references import BASELINE
@@ -298,10 +299,18 @@ def _table(name: str, found: Mapping[str, tuple[Settings | None, Sequence[Tried]
 
 
 def _choice(method: str, tuned: Tuned) -> str:
-    """Return in words which settings are chosen, as a file shows no bold, and whether they learn enough."""
+    """Return in words which settings are chosen, as a file shows no bold, and whether they learn enough.
+
+    The settings of built-in methods belong into the file that `clbench run` reads.
+    """
     from clbench.runs.tuning import LEARNED
 
     text = f"{method}: {_words(tuned.settings)} is chosen."
+    if tuned.settings and method not in built_in_methods():
+        options = " ".join(
+            f"--set.{name} {shlex.quote(str(value))}" for name, value in tuned.settings.items()
+        )
+        text += f" Make these values the defaults of the class, or run it with {options}."
     if any(one.learns_enough for one in tuned.tried):
         return text
     return (

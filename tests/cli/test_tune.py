@@ -147,6 +147,9 @@ def test_a_setting_that_fails_is_not_chosen_and_a_method_that_always_fails_stops
     said = capsys.readouterr()
     assert f"Failed at every learning rate: {names[1]}." in said.err
     assert "me--Tiny-v0.json: copy mine.json there, on every machine" in " ".join(said.err.split())
+    chosen = json.loads((tmp_path / "mine.json").read_text())["methods"][names[0]]["settings"]["step_factor"]
+    advice = f"Make these values the defaults of the class, or run it with --set.step_factor {chosen}."
+    assert f"is chosen. {advice}" in " ".join(said.out.split())
     there = tmp_path / "tuned.json"
     there.write_bytes((tmp_path / "mine.json").read_bytes())
     monkeypatch.setattr("clbench.runs.tuning.tuned_file", lambda _: there)
