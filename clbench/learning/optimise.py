@@ -60,7 +60,8 @@ def learning_rate_factor(step: int, steps: int) -> float:
 def deterministic(device: str = "cpu") -> Iterator[None]:
     """Use one thread and deterministic kernels in the block, so that a computation repeats bit for bit.
 
-    Matrices of float32 are multiplied in float32, although the program may allow TF32 or bfloat16 instead.
+    The block also undoes what a program may have set for itself: gradients are on, and matrices of float32
+    are multiplied in float32 rather than in TF32 or bfloat16.
 
     Raises:
         InputError: PyTorch's default dtype is not float32.
@@ -79,7 +80,7 @@ def deterministic(device: str = "cpu") -> Iterator[None]:
     torch.set_num_threads(1)
     torch.use_deterministic_algorithms(True)
     try:
-        with _full_precision():
+        with _full_precision(), torch.enable_grad():
             yield
     finally:
         torch.set_num_threads(threads)

@@ -156,6 +156,13 @@ def test_the_deterministic_block_multiplies_in_float32_although_the_program_allo
     assert torch.get_float32_matmul_precision() == "highest"
 
 
+def test_the_deterministic_block_has_gradients_although_the_program_turned_them_off() -> None:
+    with torch.no_grad():
+        with deterministic():
+            assert torch.is_grad_enabled()
+        assert not torch.is_grad_enabled()
+
+
 def test_the_learning_rate_can_change_at_every_step_once_the_gradient_is_known() -> None:
     weight = nn.Parameter(torch.zeros(1))
     seen: list[tuple[float, int, bool]] = []
