@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
@@ -188,11 +189,16 @@ def doctor(*, as_json: AsJson = False) -> None:
     Args:
         as_json: Print one JSON object, and no tables.
     """
+    from clbench.jobs.folders import check_folders
     from clbench.learning.registry import method_names
 
     packages, machine = _packages(), _machine()
     faults = [one.advice for one in packages if one.is_wrong]
     faults += [] if method_names() else ["pip install -e . in the checkout, as no method is installed"]
+    try:
+        check_folders({})
+    except InputError as error:
+        faults.append(str(error).removesuffix("."))
     if as_json:
         print_json(
             {
@@ -305,16 +311,18 @@ def _machine() -> dict[str, str]:
         missing = f"apt-get install {packages}" if packages else "it needs a screen"
         help_ = "not needed" if working else missing
         rendering[f"rendering: {back_end}"] = "works" if fault is None else f"does not work; {help_}"
-    return {
+    machine = {
         "python": sys.version.split()[0],
         "cores": f"{cores()} ({torch.get_num_threads()} threads in PyTorch; a run uses one)",
         "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else "none (and none is needed)",
         "arithmetic": f"{arithmetic_hash()} (the same on machines that train to the same bits)",
         **rendering,
         "films": _films(faults),
-        "cache": _folder(cache_folder(), "CLBENCH_CACHE"),
-        "demonstrations": _folder(minari_folder() / "clbench", "MINARI_DATASETS_PATH"),
     }
+    with suppress(InputError):  # the user has no home folder: the last line says so
+        machine["cache"] = _folder(cache_folder(), "CLBENCH_CACHE")
+        machine["demonstrations"] = _folder(minari_folder() / "clbench", "MINARI_DATASETS_PATH")
+    return machine
 
 
 def _films(faults: dict[str, str | None]) -> str:

@@ -49,6 +49,28 @@ def test_doctor_advises_the_extra_of_a_package_too(
     assert shown.splitlines()[-1].endswith(f"cannot run here yet: {advice}")
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("fault", ["cannot be written to: Not a directory", "no home folder"])
+def test_doctor_says_that_nothing_can_run_without_a_folder_for_data(
+    fault: str, empty_caches: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_home(_: Path) -> Path:
+        raise RuntimeError
+
+    if fault == "no home folder":
+        monkeypatch.delenv("CLBENCH_CACHE")
+        monkeypatch.setenv("XDG_CACHE_HOME", "~/cache")
+        monkeypatch.setattr(Path, "expanduser", no_home)
+    else:
+        (empty_caches / "cache").write_text("a file")
+    with pytest.raises(SystemExit, match="1"):
+        app(["doctor", "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert not found["ready"]
+    (fix,) = found["fix"]
+    assert fault in fix
+
+
 def test_methods_are_listed_by_the_prior_data_that_they_use(capsys: pytest.CaptureFixture[str]) -> None:
     app(["list"], result_action="return_value")
     shown = capsys.readouterr().out
