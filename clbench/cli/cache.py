@@ -79,7 +79,11 @@ def cache(
         older_than: Days without use after which an entry is stale.
     """
     now = time.time()
-    found = list(entries())
+    with checked_input():
+        try:
+            found = list(entries())
+        except PermissionError as error:  # the cache of another user
+            raise InputError(f"{error.filename} cannot be read: {error.strerror}.") from error
     stale = find_stale(found, older_than, now)
     console = Console(highlight=False)
     console.print(_table(found, stale, now, console.width >= WIDE))

@@ -1,5 +1,6 @@
 """`clbench cache`: the entries that it shows and deletes."""
 
+import errno
 import os
 import time
 from collections.abc import Callable
@@ -165,6 +166,26 @@ def test_datasets_that_clbench_collected_are_entries() -> None:
 @pytest.mark.usefixtures("empty_caches")
 def test_an_empty_cache_is_shown_too(capsys: pytest.CaptureFixture[str]) -> None:
     assert "Deleted 0 stale entries, 0.0 MB." in _cache(capsys, "--prune")
+
+
+@pytest.mark.parametrize("fault", ["cannot be read: Permission denied", "no home folder"])
+def test_a_cache_that_cannot_be_read_is_named(
+    fault: str, empty_caches: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path) -> bool:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+    def no_home(_: Path) -> Path:
+        raise RuntimeError
+
+    if fault == "no home folder":
+        monkeypatch.setenv("CLBENCH_CACHE", "~/cache")
+        monkeypatch.setattr(Path, "expanduser", no_home)
+    else:
+        monkeypatch.setattr(Path, "is_dir", refuse)
+    with pytest.raises(SystemExit, match="2"):
+        app(["cache"])
+    assert fault in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("empty_caches")
