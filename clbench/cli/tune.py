@@ -301,7 +301,7 @@ def _table(name: str, found: Mapping[str, tuple[Settings | None, Sequence[Tried]
 def _choice(method: str, tuned: Tuned) -> str:
     """Return in words which settings are chosen, as a file shows no bold, and whether they learn enough.
 
-    The settings of built-in methods belong into the file that `clbench run` reads.
+    The settings of built-in methods belong in the file that `clbench run` reads.
     """
     from clbench.runs.tuning import LEARNED
 
