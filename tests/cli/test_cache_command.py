@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import lose_home
 from safetensors.numpy import save_file
 
 from clbench.base.cache import cache_folder, cached, hash_of, minari_folder
@@ -168,19 +169,16 @@ def test_an_empty_cache_is_shown_too(capsys: pytest.CaptureFixture[str]) -> None
     assert "Deleted 0 stale entries, 0.0 MB." in _cache(capsys, "--prune")
 
 
+@pytest.mark.usefixtures("empty_caches")
 @pytest.mark.parametrize("fault", ["cannot be read: Permission denied", "no home folder"])
 def test_a_cache_that_cannot_be_read_is_named(
-    fault: str, empty_caches: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    fault: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(path: Path) -> bool:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
 
-    def no_home(_: Path) -> Path:
-        raise RuntimeError
-
     if fault == "no home folder":
-        monkeypatch.setenv("CLBENCH_CACHE", "~/cache")
-        monkeypatch.setattr(Path, "expanduser", no_home)
+        lose_home(monkeypatch)
     else:
         monkeypatch.setattr(Path, "is_dir", refuse)
     with pytest.raises(SystemExit, match="2"):

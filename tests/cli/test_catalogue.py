@@ -7,6 +7,7 @@ from pathlib import Path
 
 import gymnasium
 import pytest
+from helpers import lose_home
 
 from clbench import load_scenario
 from clbench.cli.main import app
@@ -54,13 +55,8 @@ def test_doctor_advises_the_extra_of_a_package_too(
 def test_doctor_says_that_nothing_can_run_without_a_folder_for_data(
     fault: str, empty_caches: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def no_home(_: Path) -> Path:
-        raise RuntimeError
-
     if fault == "no home folder":
-        monkeypatch.delenv("CLBENCH_CACHE")
-        monkeypatch.setenv("XDG_CACHE_HOME", "~/cache")
-        monkeypatch.setattr(Path, "expanduser", no_home)
+        lose_home(monkeypatch)
     else:
         (empty_caches / "cache").write_text("a file")
     with pytest.raises(SystemExit, match="1"):

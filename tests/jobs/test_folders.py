@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
+from helpers import lose_home
 
 from clbench.base.errors import InputError
 from clbench.jobs.folders import check_folders
@@ -32,11 +33,6 @@ def test_a_link_that_leads_to_itself_is_named(below: str, empty_caches: Path) ->
 
 
 def test_a_user_without_a_home_folder_is_told_which_folders_to_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    def has_no_account(_: int) -> None:
-        raise KeyError
-
-    for name in ("HOME", "CLBENCH_CACHE", "XDG_CACHE_HOME", "MINARI_DATASETS_PATH"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr("pwd.getpwuid", has_no_account)
+    lose_home(monkeypatch)
     with pytest.raises(InputError, match=r"no home folder for ~/\.cache: set CLBENCH_CACHE and MINARI"):
         check_folders({})

@@ -206,3 +206,14 @@ def stage_policies(
 ) -> list[Policy]:
     """Return the policy after every stage of a run: those that it kept below a folder, or made again."""
     return load_stages(run, kept_stages(run, checkpoints) or make_stages(run, progress))
+
+
+def lose_home(patch: pytest.MonkeyPatch) -> None:
+    """Let this process be that of a user without an account, who has named no folder for data either."""
+
+    def has_no_account(_: int) -> None:
+        raise KeyError
+
+    for name in ("HOME", "CLBENCH_CACHE", "XDG_CACHE_HOME", "MINARI_DATASETS_PATH"):
+        patch.delenv(name, raising=False)
+    patch.setattr("pwd.getpwuid", has_no_account)
