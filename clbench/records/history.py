@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from clbench.base.errors import InputError
-from clbench.records.record import CheckRow, Costs
 
 OLDEST = 2
 """Oldest schema that can be read."""
@@ -38,6 +37,19 @@ MOVED = {
     "clbench.envs.fetch.camera:FetchCamera": "clbench.envs.fetch_pixels.camera:FetchCamera",
 }
 """Names of a world and a camera up to schema 4, with their present names."""
+
+COSTS = (
+    "optimiser_steps",
+    "parameters",
+    "preparation_steps",
+    "parameters_added",
+    "bytes_kept",
+    "environment_steps",
+)
+"""Costs of schema 3. Schema 2 leaves out a cost that is not known."""
+
+CHECKS = ("stage", "step", "episodes", "successes")
+"""Columns of the checks of schema 3."""
 
 _Values = dict[str, Any]
 
@@ -84,13 +96,13 @@ def _from_2(values: _Values) -> _Values:
     if episodes is not None and isinstance(episodes.get("split"), list):
         episodes["split"] = [_split(split, "episodes: split") for split in episodes["split"]]
     if costs is not None:
-        costs = {**vars(Costs()), **costs}
+        costs = {**dict.fromkeys(COSTS), **costs}
     if policy is not None and isinstance(policy.get("stage"), list):
         _refuse_later("policy", policy, ("shift",), 2)
         policy["shift"] = [None] * len(policy["stage"])
     _refuse_later("a record", values, ("checks", "relearning"), 2)
     changed = {"run": run, "scenario": scenario, "episodes": episodes, "policy": policy, "costs": costs}
-    checks: _Values = {name: [] for name in CheckRow._fields}
+    checks: _Values = {name: [] for name in CHECKS}
     return {**_with(values, changed), "checks": checks, "relearning": None}
 
 
