@@ -28,6 +28,7 @@ from rich.text import Text
 from clbench.base.entry_points import unknown
 from clbench.base.errors import ClbenchError, InputError
 from clbench.base.text import printable
+from clbench.spec.identifiers import check_known, installed_methods, scenario_ids
 from clbench.spec.policies import policy_names
 from clbench.spec.protocol import LARGEST_SEED, MOST_SEEDS
 
@@ -56,30 +57,14 @@ Seeds = Annotated[int, whole_number(1, MOST_SEEDS)]
 """Number of seeds on the command line."""
 
 
-def _known_scenarios(_: object) -> tuple[str, ...]:
-    """Return the names that TAB completes; they are looked up when it is pressed."""
-    from clbench.spec.identifiers import scenario_ids
-
-    return tuple(scenario_ids())
-
-
-def _known_methods(_: object) -> tuple[str, ...]:
-    from clbench.spec.identifiers import installed_methods
-
-    return tuple(sorted(installed_methods()))
-
-
-def _known_policies(_: object) -> tuple[str, ...]:
-    """Return the names of the built-in policies."""
-    return tuple(policy_names())
-
-
-ScenarioId = Annotated[str, Parameter(completer=_known_scenarios)]
+# TAB completes names, which are looked up when it is pressed
+ScenarioId = Annotated[str, Parameter(completer=lambda _: tuple(scenario_ids()))]
 """Gymnasium id of a scenario on the command line."""
-MethodName = Annotated[str, Parameter(completer=_known_methods)]
+
+MethodName = Annotated[str, Parameter(completer=lambda _: tuple(sorted(installed_methods())))]
 """Name of a method on the command line."""
 
-PolicyName = Annotated[str, Parameter(completer=_known_policies)]
+PolicyName = Annotated[str, Parameter(completer=lambda _: tuple(policy_names()))]
 """Name of a policy on the command line."""
 
 AsJson = Annotated[bool, Parameter(name="--json")]
@@ -134,8 +119,6 @@ def chosen_methods(methods: Iterable[str], every: bool) -> list[str]:
 
 def check_names(scenarios: Iterable[str], methods: Iterable[str]) -> None:
     """End with exit code 2 if a name is not known, before anything heavy is imported."""
-    from clbench.spec.identifiers import check_known
-
     with checked_input():
         check_known(scenarios, methods)
 

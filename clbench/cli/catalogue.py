@@ -9,23 +9,24 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
+from packaging.requirements import Requirement
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
 from clbench import __version__
+from clbench.base.dependencies import extra_of
 from clbench.base.errors import InputError
 from clbench.base.leftovers import replacing
 from clbench.base.text import megabytes, print_plain, printable
 from clbench.cli.arguments import AsJson, checked_input, checked_writing, print_json
 from clbench.records.tables import GROUPS
-
-if TYPE_CHECKING:
-    from packaging.requirements import Requirement
+from clbench.spec.identifiers import scenario_ids
+from clbench.spec.registry import registered_scenario
 
 TaskNames = Annotated[tuple[str, ...], Parameter(consume_multiple=True, show_default=False)]
 """Names of tasks on the command line, one or more after one option."""
@@ -76,9 +77,6 @@ def _prior_data(method: Mapping[str, str | None]) -> str:
 
 def _scenarios() -> list[dict[str, Any]]:
     """Return the registered scenarios with their tasks; those that cannot be loaded have a fault instead."""
-    from clbench.spec.identifiers import scenario_ids
-    from clbench.spec.registry import registered_scenario
-
     found: list[dict[str, Any]] = []
     for name in scenario_ids():
         values: dict[str, Any] = {"id": name, **dict.fromkeys(GROUPS), "fault": None}
@@ -274,10 +272,6 @@ class _Package:
 
 
 def _packages() -> list[_Package]:
-    from packaging.requirements import Requirement
-
-    from clbench.base.dependencies import extra_of
-
     found = []
     for text in requires("clbench") or []:
         requirement = Requirement(text)

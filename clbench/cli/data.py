@@ -26,7 +26,9 @@ from clbench.cli.arguments import (
     whole_number,
 )
 from clbench.jobs.folders import check_folders
+from clbench.spec.identifiers import scenario_ids
 from clbench.spec.policies import DEFAULT_POLICY, kind_of
+from clbench.spec.registry import load_scenario
 
 if TYPE_CHECKING:
     from clbench.data.expert_rates import Measurement
@@ -46,8 +48,6 @@ DEMONSTRATIONS = {
 
 def _no_command(_: object, name: str) -> None:
     """Refuse a word that cannot be a scenario, and so is a command with a typing error."""
-    from clbench.spec.identifiers import scenario_ids
-
     if not {"/", ":"} & set(name):
         raise CycloptsError(msg=str(unknown("command or scenario", name, [*DEMONSTRATIONS, *scenario_ids()])))
 
@@ -65,7 +65,6 @@ def demonstrations(
         workers: Number of tasks to collect at once (default: all cores).
     """
     from clbench.data.demonstrations import dataset_folder, dataset_id, read_dataset
-    from clbench.spec.registry import load_scenario
 
     add_cwd_to_path()
     with checked_input():
@@ -202,7 +201,6 @@ def pretrain(
     from clbench.jobs.plan import Plan
     from clbench.learning.pretraining import SHIPPED, pretrained_folder, shipped_folder
     from clbench.policy.kinds import policy_class
-    from clbench.spec.registry import load_scenario
 
     add_cwd_to_path()
     plan = Plan()
@@ -234,7 +232,6 @@ def measure(scenario: ScenarioId, /, *tasks: str, episodes: Annotated[int, whole
     from clbench.evaluation.definition import recording_of
     from clbench.exchange.recorded import no_expert
     from clbench.jobs.bars import Bars
-    from clbench.spec.registry import load_scenario
 
     add_cwd_to_path()
     with checked_input():

@@ -19,6 +19,7 @@ from clbench.cli.data import demonstrations as collect
 
 if TYPE_CHECKING:
     from cyclopts.help import HelpPanel
+    from cyclopts.help.protocols import HelpFormatter
     from rich.console import ConsoleOptions
 
 # Named, not imported: a command imports what it needs, and the core knows its parts by name alone.
@@ -90,25 +91,20 @@ def _made_printable(record: logging.LogRecord) -> bool:
     return True
 
 
-class _Summaries:
-    """Shows commands with the first lines of their docstrings: they are read, and no command is imported.
+def _summaries(entry_points: dict[str, str]) -> HelpFormatter:
+    """Return what shows commands with the first lines of their docstrings, which are read: no import."""
 
-    Args:
-        entry_points: Entry points of the commands by name.
-    """
-
-    def __init__(self, entry_points: dict[str, str]) -> None:
-        self.entry_points = entry_points
-
-    def __call__(self, console: Console, options: ConsoleOptions, panel: HelpPanel) -> None:
+    def show(console: Console, options: ConsoleOptions, panel: HelpPanel) -> None:
         from cyclopts.help import DefaultFormatter, InlineText
 
         entries = []
         for entry in panel.entries:
-            known = self.entry_points.get(entry.names[0]) if entry.names else None
+            known = entry_points.get(entry.names[0]) if entry.names else None
             text = InlineText.from_format(_summary(known), format="plaintext") if known else entry.description
             entries.append(entry.copy(description=text))
         DefaultFormatter()(console, options, panel.copy(entries=entries))
+
+    return show
 
 
 def _summary(entry_point: str) -> str:
@@ -145,7 +141,7 @@ def _app(name: str, text: str | None, commands: dict[Group, dict[str, str]]) -> 
 def _grouped(commands: dict[str, dict[str, str]]) -> dict[Group, dict[str, str]]:
     """Return commands by the group that `--help` shows them in, in this order."""
     return {
-        Group.create_ordered(title, help_formatter=_Summaries(members)): members
+        Group.create_ordered(title, help_formatter=_summaries(members)): members
         for title, members in commands.items()
     }
 

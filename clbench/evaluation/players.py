@@ -303,7 +303,7 @@ class _ChunkPlayer:
     policy: ChunkPolicy
     executed: int | None
     whole: bool
-    cameras: SimulatorCameras | None = None
+    cameras: SimulatorCameras | None
     faults: dict[EpisodeKey, list[NDArray[np.bool_]]] = field(default_factory=dict)
     """For each episode, chunk after chunk, whether an action was not finite or was clipped, (H, 2)."""
 

@@ -85,7 +85,7 @@ def write_lerobot(folder: Path, tasks: Mapping[Task, Sequence[Demonstration]]) -
         "video_path": None,
         "features": features,
     }
-    stats = {name: _as_lists(_statistics(values)) for name, values in every.items()}
+    stats = {name: _statistics(values) for name, values in every.items()}
     for name, content in (("info.json", info), ("stats.json", stats)):
         (meta / name).write_text(json.dumps(content, indent=4), encoding="utf-8")
 
@@ -168,7 +168,7 @@ def _facts(episodes: Sequence[Columns], texts: Sequence[str]) -> pa.Table:
     rows = []
     for episode in episodes:
         first, length = int(episode["index"][0]), len(episode["index"])
-        stats = {name: _as_lists(_statistics(values)) for name, values in episode.items()}
+        stats = {name: _statistics(values) for name, values in episode.items()}
         rows.append(
             {
                 "episode_index": int(episode["episode_index"][0]),
@@ -186,20 +186,20 @@ def _facts(episodes: Sequence[Columns], texts: Sequence[str]) -> pa.Table:
     return pa.Table.from_pylist(rows)
 
 
-def _statistics(values: NDArray[Any]) -> Columns:
+def _statistics(values: NDArray[Any]) -> dict[str, list[Any]]:
     """Return the statistics of a column: per number, or per colour (3, 1, 1) from 0 to 1 for pictures."""
     if values.ndim == 4:
         found = {name: value.reshape(3, 1, 1) for name, value in _of_pictures(values).items()}
-        return {**found, "count": np.array([len(values)])}
-    rows = values.reshape(len(values), -1).astype(np.float64)
-    found = {
-        "min": rows.min(axis=0),
-        "max": rows.max(axis=0),
-        "mean": rows.mean(axis=0),
-        "std": rows.std(axis=0),
-    }
-    found |= _named(np.quantile(rows, QUANTILES, axis=0))
-    return {**found, "count": np.array([len(values)])}
+    else:
+        rows = values.reshape(len(values), -1).astype(np.float64)
+        found = {
+            "min": rows.min(axis=0),
+            "max": rows.max(axis=0),
+            "mean": rows.mean(axis=0),
+            "std": rows.std(axis=0),
+            **_named(np.quantile(rows, QUANTILES, axis=0)),
+        }
+    return {**{name: value.tolist() for name, value in found.items()}, "count": [len(values)]}
 
 
 def _of_pictures(pictures: NDArray[np.uint8]) -> Columns:
@@ -236,10 +236,6 @@ def _of_pictures(pictures: NDArray[np.uint8]) -> Columns:
 def _named(quantiles: Iterable[NDArray[np.float64]]) -> Columns:
     """Return quantiles by the names that LeRobot gives them."""
     return {f"q{100 * share:02.0f}": one for share, one in zip(QUANTILES, quantiles, strict=True)}
-
-
-def _as_lists(stats: Columns) -> dict[str, list[Any]]:
-    return {name: values.tolist() for name, values in stats.items()}
 
 
 def _write_table(path: Path, table: pa.Table) -> None:

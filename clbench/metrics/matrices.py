@@ -223,9 +223,7 @@ def _check_range(known: Mapping[Cell, float], unit: Unit, where: str) -> None:
             raise InputError(f"{where}{cell}: expected {words}, found {rate:g}.")
 
 
-def layout_of(
-    tasks: Names, retained: Names = (), target: Names | None = None, held_out: Names = ()
-) -> Layout:
+def layout_of(tasks: Names, retained: Names, target: Names | None, held_out: Names) -> Layout:
     """Return the layout of a matrix whose columns are `tasks`; the groups are those of `from_matrix`."""
     known, never = _names(retained), _names(held_out)
     rest = tuple(task for task in tasks if task not in (*known, *never))

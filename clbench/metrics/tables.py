@@ -15,7 +15,6 @@ import csv
 import difflib
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from clbench.base.errors import InputError
@@ -34,16 +33,6 @@ MISSING = ("", "-", "nan")
 """Texts of a cell without a rate, in small letters."""
 OTHER_MARKS = {";": "semicolons", "\t": "tabs"}
 """What other programs put between the cells."""
-
-
-@dataclass(frozen=True)
-class _Line:
-    """A line of a table."""
-
-    number: int
-    """Its number in the file, from 1."""
-    fields: list[str]
-    """Its cells, without spaces around them."""
 
 
 def is_table(name: str) -> bool:
@@ -124,7 +113,7 @@ def _read(path: Path) -> tuple[dict[Cell, float], list[str]]:
     rows = csv.reader([line for _, line in numbered], strict=True)
     try:
         lines = [
-            _Line(number, [field.strip() for field in row])
+            (number, [field.strip() for field in row])
             for (number, _), row in zip(numbered, rows, strict=True)
         ]
     except (csv.Error, ValueError) as error:
@@ -133,18 +122,18 @@ def _read(path: Path) -> tuple[dict[Cell, float], list[str]]:
         raise InputError(f"{path.name}: not a CSV file: {reason}.") from None
     if len(lines) < 2:
         raise InputError(f"{path.name}: expected a line with the names of the columns, and rows below it.")
-    header, *body = lines
-    long = _check_header(header.fields, path.name)
+    (_, header), *body = lines
+    long = _check_header(header, path.name)
     cells: dict[Cell, float] = {}
     seen: dict[Cell, int] = {}
-    for line in body:
-        where = f"{path.name}, line {line.number}"
-        if len(line.fields) != len(header.fields):
-            raise InputError(f"{where}: expected {len(header.fields)} cells, found {len(line.fields)}.")
-        for cell, text in _cells(dict(zip(header.fields, line.fields, strict=True)), long, where):
+    for number, fields in body:
+        where = f"{path.name}, line {number}"
+        if len(fields) != len(header):
+            raise InputError(f"{where}: expected {len(header)} cells, found {len(fields)}.")
+        for cell, text in _cells(dict(zip(header, fields, strict=True)), long, where):
             if cell in seen:
                 raise InputError(f"{where}: {cell} was already given on line {seen[cell]}.")
-            seen[cell], cells[cell] = line.number, _rate(text, f"{where}, {cell}")
+            seen[cell], cells[cell] = number, _rate(text, f"{where}, {cell}")
     tasks = list(dict.fromkeys(cell.task for cell in cells))
     return cells, tasks
 

@@ -67,11 +67,7 @@ def _seeds(matrices: Matrices) -> str:
 
 def _family(report: Report, family: str) -> Iterator[RenderableType]:
     """Yield the definitions of a family that have a value."""
-    found = [
-        name
-        for name, one in DEFINITIONS.items()
-        if one.family == family and any(value.reason is None for value in report.values[name].values())
-    ]
+    found = [name for name, one in DEFINITIONS.items() if one.family == family and _some(report.values[name])]
     if found:
         yield Text(f"\n{family.capitalize()}: {FAMILIES[family]}", style="bold")
     for name in found:

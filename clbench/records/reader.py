@@ -62,13 +62,9 @@ def read_record(path: Path | str) -> Record:
     try:
         return _record(read_json(Path(path)))
     except (StrictJSONError, InputError, RecordError) as error:
-        kind = UnreadableRecordError if _may_be_sound(error) else RecordError
+        may_be_sound = isinstance(error, UnreadableRecordError) or refusal(error) is not None
+        kind = UnreadableRecordError if may_be_sound else RecordError
         raise kind(f"{path}: {error}") from error
-
-
-def _may_be_sound(error: Exception) -> bool:
-    """Return whether a reading error says nothing against the record itself."""
-    return isinstance(error, UnreadableRecordError) or refusal(error) is not None
 
 
 def home_of(run: RunInfo) -> Path:

@@ -6,7 +6,6 @@ repeats the actions of an `Evaluator`, so a film ends like the recorded episode.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import itertools
 from collections import defaultdict
@@ -216,14 +215,9 @@ class Film:
         """Write the film, in one step, as GIF or MP4 depending on the name of the file.
 
         Args:
-            path: Path of the film.
+            path: Path of the film, which `check_format` has accepted.
             fps: Number of steps shown per second.
-
-        Raises:
-            MissingPackageError: MP4 needs a package that is not installed.
-            InputError: The name of the file has another ending.
         """
-        check_format(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as partial:
             (self._save_gif if path.suffix == ".gif" else self._save_mp4)(partial, fps)
@@ -259,7 +253,7 @@ class Film:
         # one thread and no encoder name in the file: the same film has the same bytes
         exact = ["-threads", "1", "-fflags", "+bitexact", "-flags:v", "+bitexact", "-crf", "23", "-f", "mp4"]
         frames = write_frames(path, self.size, fps=fps, macro_block_size=2, output_params=exact)
-        with contextlib.closing(frames) as writer:
+        with closing(frames) as writer:
             writer.send(None)
             for time in range(len(self) + round(HOLD_SECONDS * fps)):
                 writer.send(self.frame(min(time, len(self) - 1)).tobytes())

@@ -88,7 +88,7 @@ def execute(
     lease = Lease(folder)
     with lease.held():
         with deterministic(resolved.spec.device):
-            under_way = _Run.start(resolved, folder, lease, progress, kept, log)
+            under_way = _Run(resolved, folder, lease, progress, kept, log)
             record = under_way.go()
         lease.check()
         with machine_needed():
@@ -154,64 +154,45 @@ def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
     seconds[name] += time.perf_counter() - begin
 
 
-@dataclasses.dataclass
 class _Run:
     """A run in progress: the trainer, the examiner, and the record so far.
 
     After each stage it writes a checkpoint of the trainer and of the record, and the next stage starts from
     this checkpoint. An interrupted run therefore continues as if nothing had happened.
+
+    Args:
+        run: The run. On first use, its policy is pretrained and its data are collected.
+        resume_folder: Folder in the cache with the state after each stage, from which an interrupted run
+            continues.
+        lease: The right to write into this folder.
+        progress: Called with the length of the work done since its last call.
+        kept: Folder below which the policies of all stages are kept.
+        tensorboard: Folder below which the run is logged.
     """
 
-    run: ResolvedRun
-    trainer: Trainer
-    examiner: Examiner
-    checker: Checker
-    record: Record
-    log: Log
-    progress: ProgressCallback
-    resume_folder: Path
-    """Folder in the cache with the state after each stage, from which an interrupted run continues."""
-    lease: Lease
-    """The right to write into this folder."""
-    kept: Path | None
-    """Folder below which the policies of all stages are kept."""
-    tensorboard: Path | None
-    inputs: dict[str, Any]
-    """Everything that these states depend on, as of the start: later changes of the code do not count."""
-    begin: float = dataclasses.field(default_factory=time.perf_counter)
-    seconds_before: float = 0.0
-    """Seconds that the run took before it was interrupted."""
-
-    @classmethod
-    def start(
-        cls,
+    def __init__(
+        self,
         run: ResolvedRun,
         resume_folder: Path,
         lease: Lease,
         progress: ProgressCallback,
         kept: Path | None,
         tensorboard: Path | None,
-    ) -> _Run:
-        """Return a run with all its parts; the policy is pretrained and data are collected on first use."""
-        scenario, spec = run.scenario, run.spec
-        trainer = Trainer.open(scenario, run.new_method, spec.seed, spec.device)
-        record = _new_record(run, trainer)
-        examiner = Examiner(scenario, run.protocol, trainer.data, trainer.pretrained, spec.seed, progress)
-        checker = Checker(scenario, run.protocol, spec.seed)
-        return cls(
-            run=run,
-            trainer=trainer,
-            examiner=examiner,
-            checker=checker,
-            record=record,
-            log=Log(),
-            progress=progress,
-            resume_folder=resume_folder,
-            lease=lease,
-            kept=kept,
-            tensorboard=tensorboard,
-            inputs=_inputs(run),
-        )
+    ) -> None:
+        self.run, self.resume_folder, self.lease = run, resume_folder, lease
+        self.progress, self.kept, self.tensorboard = progress, kept, tensorboard
+        scenario, protocol, seed = run.scenario, run.protocol, run.spec.seed
+        self.trainer = Trainer.open(scenario, run.new_method, seed, run.spec.device)
+        self.record = _new_record(run, self.trainer)
+        data, pretrained = self.trainer.data, self.trainer.pretrained
+        self.examiner = Examiner(scenario, protocol, data, pretrained, seed, progress)
+        self.checker = Checker(scenario, protocol, seed)
+        self.log = Log()
+        self.inputs = _inputs(run)
+        """Everything that these states depend on, as of the start: later changes of the code do not count."""
+        self.begin = time.perf_counter()
+        self.seconds_before = 0.0
+        """Seconds that the run took before it was interrupted."""
 
     def go(self) -> Record:
         """Go through all stages that have no checkpoint yet, and return the record."""

@@ -15,7 +15,7 @@ from clbench.base.text import counted, did_you_mean
 from clbench.records.paths import label_of, record_path, table_name
 from clbench.records.record import RunInfo, ScenarioInfo
 from clbench.runs.tuning import tuned_settings
-from clbench.spec.fields import check_whole, is_whole
+from clbench.spec.fields import check_whole
 from clbench.spec.policies import DEFAULT_POLICY, kind_of
 from clbench.spec.protocol import LARGEST_SEED, Protocol, ScoredSplit
 from clbench.spec.registry import load_scenario
@@ -67,8 +67,6 @@ class RunSpec:
             raise WrongTypeError(f"changes of a run must be values by name, not {self.changes!r}.")
         if type(self.perturb) is not bool:
             raise WrongTypeError(f"perturb of a run must be True or False, not {self.perturb!r}.")
-        if is_whole(self.seed):
-            object.__setattr__(self, "seed", int(self.seed))  # no record holds a number of NumPy
         check_whole(self, 0, "seed", "order", most=LARGEST_SEED)
         if self.targets is not None:
             check_whole(self, 1, "targets")

@@ -8,7 +8,7 @@ from typing import Any
 
 from clbench.base.dependencies import require
 from clbench.learning.adaptation import Step
-from clbench.records.record import Record
+from clbench.records.record import PolicyRow, Record
 from clbench.spec.protocol import Point
 
 LOG_STEPS = 10
@@ -89,27 +89,17 @@ class Log:
 def _report(record: Record, point: Point) -> Iterator[tuple[str, float | None]]:
     """Yield tag and value of each scalar at an evaluation point."""
     outcomes: dict[str, list[int]] = {}
-    for row in _rows(record.episodes, point):
-        outcomes.setdefault(f"success_{row['split']}/{row['task']}", []).append(row["success"])
+    for episode in record.episode_rows():
+        if episode.point == point:
+            outcomes.setdefault(f"success_{episode.split}/{episode.task}", []).append(episode.success)
     for tag, successes in outcomes.items():
         yield tag, sum(successes) / len(successes)
-    answers = list(_rows(record.answers, point))
-    asked = [row for row in answers if row["asked"]]  # a policy that cannot answer is asked no questions
+    answers = (row for row in record.answer_rows() if row[:2] == point)
+    asked = [row for row in answers if row.asked]  # a policy that cannot answer is asked no questions
     for row in asked:
-        yield f"question_accuracy/{row['kind']}", row["correct"] / row["asked"]
+        yield f"question_accuracy/{row.kind}", row.correct / row.asked
     if asked:
-        correct, total = (sum(row[name] for row in asked) for name in ("correct", "asked"))
-        yield "question_accuracy/all", correct / total
-    for row in _rows(record.policy, point):
-        yield "policy/update_sparsity", row["update_sparsity"]
-        yield "policy/activation_drift", row["activation_drift"]
-        yield "policy/shift", row["shift"]
-        yield "policy/captured", row["captured"]
-
-
-def _rows(columns: Mapping[str, list[Any]], point: Point) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a table that belong to an evaluation point."""
-    for values in zip(*columns.values(), strict=True):
-        row = dict(zip(columns, values, strict=True))
-        if (row["stage"], row["step"]) == point:
-            yield row
+        yield "question_accuracy/all", sum(row.correct for row in asked) / sum(row.asked for row in asked)
+    for change in record.policy_rows():
+        if change[:2] == point:
+            yield from ((f"policy/{name}", getattr(change, name)) for name in PolicyRow._fields[2:])

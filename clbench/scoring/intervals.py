@@ -95,12 +95,6 @@ class Estimate:
         """Return whether the interval describes other seeds and is below `bar`."""
         return self.of_seeds and self.high is not None and self.high < bar
 
-    def transformed(self, increasing: Callable[[float], float]) -> Estimate:
-        """Return the estimate of an increasing function of the quantity."""
-        ends = (self.value, self.low, self.high)
-        value, low, high = (None if end is None else increasing(end) for end in ends)
-        return Estimate(value, low, high, self.of_seeds)
-
 
 NO_ESTIMATE = Estimate(None, None, None)
 """The estimate of a value that cannot be computed."""
@@ -237,7 +231,8 @@ def interval(
         found = interval(
             math.log(value), np.log(without_one), other_episodes and (lambda: np.log(other_episodes()))
         )
-        return replace(found.transformed(math.exp), value=value)
+        low, high = (None if end is None else math.exp(end) for end in (found.low, found.high))
+        return replace(found, value=value, low=low, high=high)
     if not math.isfinite(value):
         return NO_ESTIMATE
     # A metric that has no value without one of the seeds, or with other episodes, has no honest interval.

@@ -170,10 +170,6 @@ def accuracy_diaz_rodriguez(rates: Rates) -> Array:
     return _mean(_matrix(rates), np.tri(len(rates.layout.target)))
 
 
-def _backward_transfer(rates: Rates) -> Array:
-    return _mean(-_drops(rates), _later(rates))
-
-
 @metric(
     formula="mean of R[l][k] - R[k][k] over the targets k and the stages l after k",
     source="Diaz-Rodriguez et al. 2018, arXiv 1810.13166 (BWT)",
@@ -183,7 +179,7 @@ def _backward_transfer(rates: Rates) -> Array:
 )
 def backward_transfer_diaz_rodriguez(rates: Rates) -> Array:
     """Change in success on the earlier targets, over all later stages and not only the last one."""
-    return _backward_transfer(rates)
+    return _mean(-_drops(rates), _later(rates))
 
 
 @metric(
@@ -194,7 +190,7 @@ def backward_transfer_diaz_rodriguez(rates: Rates) -> Array:
 )
 def remembering_diaz_rodriguez(rates: Rates) -> Array:
     """1 minus the size of the negative part of backward transfer."""
-    return 1 - np.abs(np.minimum(_backward_transfer(rates), 0))
+    return 1 - np.abs(np.minimum(backward_transfer_diaz_rodriguez(rates), 0))
 
 
 @metric(
@@ -205,7 +201,7 @@ def remembering_diaz_rodriguez(rates: Rates) -> Array:
 )
 def positive_backward_transfer_diaz_rodriguez(rates: Rates) -> Array:
     """The positive part of backward transfer."""
-    return np.maximum(_backward_transfer(rates), 0)
+    return np.maximum(backward_transfer_diaz_rodriguez(rates), 0)
 
 
 @metric(
@@ -405,7 +401,6 @@ def minimum_retention(rates: Rates) -> Array:
     The lowest of several noisy rates is too low by a part of their noise, all the more since fewer episodes
     are run before the end of a stage.
     """
-    curves = rates.retained_curves
     if not len(rates.layout.target):
         return average(rates.retained[..., 0, :0])
-    return average(curves.min(axis=(-3, -2)))
+    return average(rates.retained_curves.min(axis=(-3, -2)))

@@ -90,7 +90,8 @@ def kendall_tau(one: Array, other: Array) -> Array:
     geometric mean of the numbers of untied pairs: Kendall 1945, doi 10.2307/2332303.
     """
     first, second = np.triu_indices(one.shape[-1], 1)
-    signs, others = (_signs(values[..., first] - values[..., second]) for values in (one, other))
+    differences = (values[..., first] - values[..., second] for values in (one, other))
+    signs, others = (np.where(np.abs(found) < TIE, 0.0, np.sign(found)) for found in differences)
     untied = np.sqrt(np.abs(signs).sum(axis=-1) * np.abs(others).sum(axis=-1))
     return np.asarray((signs * others).sum(axis=-1) / np.where(untied > 0, untied, np.nan))
 
@@ -115,10 +116,6 @@ def chance_of(one: Array, other: Array) -> float:
         (first,), tau, permutation_type="pairings", vectorized=True, n_resamples=ORDERS, axis=-1, rng=0
     )
     return float(test.pvalue)
-
-
-def _signs(differences: Array) -> Array:
-    return np.where(np.abs(differences) < TIE, 0.0, np.sign(differences))
 
 
 def concordance(values: Array) -> Concordance | None:

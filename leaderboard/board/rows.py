@@ -113,7 +113,10 @@ def compute_board(records: Path, only: Container[str] | None = None) -> Board:
         not_shown=tuple(sorted([*not_shown, *without], key=lambda entry: entry.path)),
         frontiers=frontiers_of(ladder),
         predictions={name: tuple(predictions(rows)) for name, rows in by_name.items()},
-        tied={name: tied_gains(name, _rivals(rows), ladder) for name, rows in by_name.items()},
+        tied={
+            name: tied_gains(name, {row.method: row.scores for row in competing(rows)}, ladder)
+            for name, rows in by_name.items()
+        },
     )
 
 
@@ -127,11 +130,6 @@ def runs_of_rows(records: Path, only: Container[str] | None = None) -> Sifted:
     runs, refused = read_runs(records, read_run, ALIKE, only)
     runs, alone = _beside_rows(runs)
     return runs, [*refused, *alone]
-
-
-def _rivals(rows: Iterable[Row]) -> dict[str, Runs]:
-    """Return the scores of the rows that compete, plain fine-tuning at the chosen setting among them."""
-    return {row.method: row.scores for row in competing(rows)}
 
 
 def _beside_rows(runs: list[Run]) -> Sifted:

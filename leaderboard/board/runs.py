@@ -187,7 +187,7 @@ def _check_settings(run: RunInfo) -> None:
 
 
 @cache
-def _declared(table: str, method: str, tuned: bool = True) -> tuple[dict[str, Any], dict[str, Any]]:
+def _declared(table: str, method: str, tuned: bool) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the prior data that a built-in method uses, and its settings, tuned for the table or not."""
     cls = built_in_methods()[method].load()
     settings = tuned_settings(table, method) if tuned else {}

@@ -110,7 +110,7 @@ def without_an_arm(
     evidence: Evidence,
     figures: Sequence[Figure],
     controls: Sequence[Figure],
-    of_all: Verdict | None = None,
+    of_all: Verdict | None,
     *reasons: tuple[str, str],
 ) -> Finding:
     """Return the finding on a board on which no arm counts.
@@ -119,7 +119,7 @@ def without_an_arm(
         evidence: Records of the board.
         figures: Figures of all arms.
         controls: Other figures.
-        of_all: Verdict if all arms counted.
+        of_all: Verdict if all arms counted; None if it is not told.
         reasons: Further reasons, as in `cannot_be_shown`.
     """
     shares = tuple(one(evidence, arm) for arm in ARMS for one in (share_between, share_afterwards))

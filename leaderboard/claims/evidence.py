@@ -26,7 +26,6 @@ from clbench.scoring.intervals import (
 from clbench.scoring.metrics import load_metric
 from clbench.scoring.rates import Rates
 from clbench.scoring.reading import is_number
-from clbench.scoring.scores import Scores
 
 from ..board.costs import step_ratio
 from ..board.frontier import FACTOR, apart_from_the_factor, ladder_of, like_the_board, read_ladder
@@ -140,7 +139,7 @@ class Evidence:
         found = NO_ESTIMATE
         if common and not missing:
             generator = row_generator(self.scenario, what)
-            scores = self._scores(methods, common)
+            scores = {label: [self.runs[label][seed].scores for seed in common] for label in methods}
             found = estimate_quantity(quantity, scores, generator, span=span, ratio=ratio)
         if not missing and not note:
             if not common:
@@ -150,9 +149,6 @@ class Evidence:
             elif len(common) < LEAST_SEEDS:
                 note = "one seed: the interval does not cover other seeds and decides nothing"
         return Figure(what, methods, found, common, missing, note, form, span, ratio)
-
-    def _scores(self, methods: Iterable[str], seeds: Iterable[int]) -> dict[str, list[Scores]]:
-        return {label: [self.runs[label][seed].scores for seed in seeds] for label in methods}
 
     def common_seeds(self, methods: Iterable[str]) -> tuple[int, ...]:
         """Return the seeds for which all methods have a run."""

@@ -240,10 +240,8 @@ class Card:
         if not known or "joint" not in self.rows:
             return Bar("best final average minus that of joint", MOST_BEHIND, NO_ESTIMATE)
         best = max(known, key=known.__getitem__)
-        generator = row_generator(self.scenario.id, f"{best} - joint")
-        runs, others = self.rows[best].scores, self.rows["joint"].scores
         words = f"best final average (of {printable(best)}) minus that of joint"
-        return Bar(words, MOST_BEHIND, paired_difference(RANKED_BY, runs, others, generator))
+        return Bar(words, MOST_BEHIND, self._difference(best, "joint"))
 
     def _other_version(self) -> list[str]:
         """Return the fields in which the records differ from the code."""

@@ -50,9 +50,8 @@ def spaces_of(scenario: Scenario) -> Spaces:
     """Return what a policy sees and does in a scenario."""
     config, first = policy_config(scenario), scenario.tasks[0]
     world = resolve(first.world)
-    described = getattr(
-        world, "vector_world", world
-    )  # for a MuJoCo world, the class of many lanes has the words
+    # for a MuJoCo world, the class of many lanes has the words
+    described = getattr(world, "vector_world", world)
     words = [_second_paragraph(described)]
     parts: tuple[tuple[str, str], ...] = ()
     if first.camera is not None:  # a policy sees what the camera passes on, and not the state of the world
@@ -72,10 +71,8 @@ def spaces_of(scenario: Scenario) -> Spaces:
 
 def _second_paragraph(cls: type) -> str:
     """Return the second paragraph of a docstring in one line, empty if it has no text there."""
-    paragraphs = (inspect.getdoc(cls) or "").split("\n\n")[1:2]
-    return (
-        " ".join(" ".join(paragraphs).split()) if paragraphs and not paragraphs[0].startswith("Args:") else ""
-    )
+    second = "".join((inspect.getdoc(cls) or "").split("\n\n")[1:2])
+    return "" if second.startswith("Args:") else " ".join(second.split())
 
 
 def _state_module(world: str) -> str | None:

@@ -11,7 +11,7 @@ import hashlib
 import json
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -295,8 +295,9 @@ def _retrain(subject: Subject, progress: ProgressCallback) -> list[Check]:
     if again.failure:
         return [*before, Check("whole run", f"it failed: {again.failure}", False)]
     wrong = []
+    records = [asdict(record) for record in (subject.run.record, again)]
     for part in PARTS:
-        theirs, ours = (_as_dictionary(getattr(record, part)) for record in (subject.run.record, again))
+        theirs, ours = (values[part] for values in records)
         if theirs != ours:
             names = ", ".join(differences(theirs, ours))
             wrong.append(f"{part} ({names})" if names else part)
@@ -361,10 +362,6 @@ def _origin(record: Record) -> dict[str, Any]:
         found |= {f"{part} {name}": entries.get(name) for name in names or sorted(entries)}
     found.pop("versions clbench", None)
     return {**found, "pretrained": record.fingerprint.get("pretrained")}
-
-
-def _as_dictionary(part: Any) -> Any:
-    return asdict(part) if is_dataclass(part) and not isinstance(part, type) else part
 
 
 # ---- the job -----------------------------------------------------------------------------------------------

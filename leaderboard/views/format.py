@@ -175,14 +175,10 @@ def agreement_text(found: Concordance | None) -> str:
     if found is None:
         return ""
     alike = f"the {found.seeds} seeds agree on the order of the {found.rows} methods (without controls)"
+    words = f"Kendall's W {found.w:.2f}, {chance_text(found.chance)}"
     if found.certain:
-        return f"{alike[0].upper()}{alike[1:]} more than chance would explain: {concordance_text(found)}."
-    return f"It is not certain that {alike}: {concordance_text(found)}."
-
-
-def concordance_text(found: Concordance) -> str:
-    """Return Kendall's W with the probability of chance."""
-    return f"Kendall's W {found.w:.2f}, {chance_text(found.chance)}"
+        return f"{alike[0].upper()}{alike[1:]} more than chance would explain: {words}."
+    return f"It is not certain that {alike}: {words}."
 
 
 def chance_text(chance: float) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from clbench.base.text import counted
 from clbench.records.paths import table_parts
@@ -16,7 +16,6 @@ from ..board.summary import letters_of, tables_of
 from ..policies.compared import Comparisons
 from ..policies.decoders import read_decoding
 from .format import (
-    Column,
     agreement_text,
     column_title,
     gain_text,
@@ -44,7 +43,7 @@ def markdown(board: Board, comparisons: Comparisons) -> str:
         grids=grids(by_scenario, least=2),
         by_scenario=by_scenario,
         shown=shown,
-        all_shown=_all_shown(by_scenario.values()),
+        all_shown=dict.fromkeys(column for rows in by_scenario.values() for column in shown(rows)),
         agreement_text=agreement_text,
         comparisons=comparisons,
         column_title=column_title,
@@ -71,11 +70,6 @@ def _tied_text(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[TiedG
         for row in rows
         if sides.get(row.method) == 0 and (row.estimates["gain"].value or 0.0) > 0
     )
-
-
-def _all_shown(tables: Iterable[Sequence[Row]]) -> list[Column]:
-    """Return the columns of all tables, each once."""
-    return list(dict.fromkeys(column for rows in tables for column in shown(rows)))
 
 
 def _ends(metric: Metric) -> list[str]:

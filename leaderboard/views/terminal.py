@@ -242,7 +242,7 @@ def _columns(rows: Sequence[RowSummary], sort: str | None) -> list[Column]:
     return columns
 
 
-def _metric_heads(rows: Sequence[RowSummary], sort: str | None = None) -> list[_Head]:
+def _metric_heads(rows: Sequence[RowSummary], sort: str | None) -> list[_Head]:
     """Return the table's columns for the metrics of `_columns`."""
 
     def head(column: Column) -> _Head:

@@ -376,32 +376,21 @@ def test_what_only_the_end_of_a_targets_stage_has_is_refused_before(
         Scores.from_record(record, partial=True)
 
 
-@pytest.mark.parametrize(
-    ("names", "words"),
-    [
-        *((names, "retained must be a list of task names") for names in (None, "skill_0", [1])),
-        *((names, "a task name occurs twice") for names in (["target_0"], ["skill_0", "skill_0"])),
-    ],
-)
-def test_unclear_task_names_are_refused(names: Any, words: str, make_record: MakeRecord) -> None:
+@pytest.mark.parametrize("names", [["target_0"], ["skill_0", "skill_0"]])
+def test_a_task_name_that_occurs_twice_is_refused(names: list[str], make_record: MakeRecord) -> None:
     record = make_record(MATRIX)
     record.scenario.retained = names
-    with pytest.raises(RecordError, match=f"scenario: {words}"):
+    with pytest.raises(RecordError, match="scenario: a task name occurs twice"):
         Scores.from_record(record, partial=True)
 
 
-@pytest.mark.parametrize("steps", [None, 400, [], [400, 100], [400, 400], [0, 400], [100.0], ["400"], [True]])
-def test_a_scenario_without_clear_evaluation_steps_is_refused(steps: Any, make_record: MakeRecord) -> None:
+@pytest.mark.parametrize("steps", [[], [400, 100], [400, 400], [0, 400], [100, 10**9 + 1]])
+def test_a_scenario_without_clear_evaluation_steps_is_refused(
+    steps: list[int], make_record: MakeRecord
+) -> None:
     record = make_record(MATRIX)
     record.scenario.evaluation_steps = steps
     with pytest.raises(RecordError, match="evaluation_steps"):
-        Scores.from_record(record, partial=True)
-
-
-def test_a_run_of_an_unknown_split_is_refused(make_record: MakeRecord) -> None:
-    record = make_record(MATRIX)
-    record.run.split = "all"  # type: ignore[assignment] # the fault
-    with pytest.raises(RecordError, match="split must be test or validation"):
         Scores.from_record(record, partial=True)
 
 

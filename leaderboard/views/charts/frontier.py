@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any, TypeAlias
 
-from ...board.frontier import Curve, Rung
+from ...board.frontier import Curve
 from ...board.summary import DIVISIONS, WITH_DEMONSTRATIONS
 from ..format import format_interval, number_text
 from .vega import SYSTEM_FONT, Size, Spec, axis, colour, heading, layer, rounded, specification, subtitle
@@ -86,7 +86,7 @@ def _points(curve: Curve) -> Points:
         {
             "method": curve.method,
             "line": BESIDE if curve.is_baseline else curve.division,
-            "learning rate": _text(rung.factor),
+            "learning rate": f"\N{MULTIPLICATION SIGN} {number_text(rung.factor, 'g')}",
             "order": rung.factor,
             "x": rounded(rung.learned.value),
             "y": rounded(rung.kept.value),
@@ -97,16 +97,8 @@ def _points(curve: Curve) -> Points:
             "seeds": len(rung.seeds),
         }
         for rung in curve.rungs
-        if _is_known(rung)
+        if rung.learned.value is not None and rung.kept.value is not None
     ]
-
-
-def _is_known(rung: Rung) -> bool:
-    return rung.learned.value is not None and rung.kept.value is not None
-
-
-def _text(factor: float) -> str:
-    return f"\N{MULTIPLICATION SIGN} {number_text(factor, 'g')}"
 
 
 def _look(points: Points, size: Size) -> Spec:

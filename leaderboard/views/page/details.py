@@ -20,7 +20,7 @@ from clbench.scoring.reading import is_number
 from ...board.commands import commands_of
 from ...board.rows import Row
 from ...board.runs import Run
-from ...board.summary import ELSEWHERE
+from ...board.summary import ELSEWHERE, grouped
 from ..format import number_text
 
 LONGEST = 160
@@ -85,9 +85,7 @@ def same_or_each(of_runs: Sequence[tuple[int, Sequence[Entry]]]) -> list[Entry]:
     names = dict.fromkeys(entry.name for _, entries in of_runs for entry in entries)
     found = []
     for name in names:
-        texts: dict[str, list[int]] = {}
-        for seed, entries in of_runs:
-            texts.setdefault(dict(entries).get(name, "none"), []).append(seed)
+        texts = grouped((dict(entries).get(name, "none"), seed) for seed, entries in of_runs)
         parts = [text if len(texts) == 1 else f"{text} ({_seeds(seeds)})" for text, seeds in texts.items()]
         found.append(Entry(name, "; ".join(parts)))
     return found[:MOST]

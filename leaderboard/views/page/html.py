@@ -198,16 +198,12 @@ def _colours() -> str:
 def _shade(share: float) -> str:
     """Return the colours of a cell, with black or white text, whichever is more legible."""
     place = min(share * (len(CIVIDIS) - 1), len(CIVIDIS) - 1.000001)
-    low, high = (_rgb(CIVIDIS[int(place) + step]) for step in (0, 1))
+    low, high = (bytes.fromhex(CIVIDIS[int(place) + step][1:]) for step in (0, 1))
     mixed = [round(a + (b - a) * (place % 1)) for a, b in zip(low, high, strict=True)]
     linear = [(c / 255 / 12.92) if c <= 10 else ((c / 255 + 0.055) / 1.055) ** 2.4 for c in mixed]
     luminance = 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
     ink = "#000" if (luminance + 0.05) ** 2 > 1.05 * 0.05 else "#fff"
     return f"background:#{bytes(mixed).hex()};color:{ink}"
-
-
-def _rgb(colour: str) -> tuple[int, ...]:
-    return tuple(bytes.fromhex(colour[1:]))
 
 
 def _data(views: Sequence[ScenarioView]) -> dict[str, Any]:

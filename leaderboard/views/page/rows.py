@@ -297,13 +297,11 @@ def _stages(row: Row) -> list[MatrixLine]:
     layout, names = row.runs[0].scores.layout, places(row)
     begin = "after the old skills" if row.division == "online" else "pretrained"
     success = np.mean([run.scores.rates().success for run in row.runs], axis=0)
-    stages = []
-    for stage, line in enumerate(success):
-        stages.append(
-            MatrixLine(
-                printable(f"after {names[stage - 1]}") if stage else begin,
-                tuple((number_text(value, ".2f", MISSING), value) for value in map(finite, line)),
-                len(layout.retained) + stage - 1 if stage else None,
-            )
+    return [
+        MatrixLine(
+            printable(f"after {names[stage - 1]}") if stage else begin,
+            tuple((number_text(value, ".2f", MISSING), value) for value in map(finite, line)),
+            len(layout.retained) + stage - 1 if stage else None,
         )
-    return stages
+        for stage, line in enumerate(success)
+    ]

@@ -110,7 +110,8 @@ def _above(ahead: Sequence[Row], gains: Mapping[str, float]) -> str:
             texts = [number_text(gains[row.method], ".2f") for row in (members[-1], members[0])]
             by = texts[0] if texts[0] == texts[1] else f"{texts[0]} to {texts[1]}"
             verb = "ends" if len(members) == 1 else "end"
-            parts.append((f"with{kind} prior demonstrations", _listed(members), verb, by))
+            names = _names([row.method for row in members])
+            parts.append((f"with{kind} prior demonstrations", names, verb, by))
     (where, names, verb, by), *more = parts
     first = f"{where.capitalize()}, {names} {verb} {by} above plain fine-tuning"
     rest = (f"{where}, {names} {verb} {by} above it" for where, names, verb, by in more)
@@ -289,10 +290,6 @@ def _facts(row: Row, baseline: Row | None) -> list[Fact]:
 def _fact(title: str, one: Estimate, form: str) -> Fact:
     interval = "" if one.low is None else f"{number_text(one.low, form)} to {number_text(one.high, form)}"
     return Fact(title, number_text(one.value, form, MISSING), interval)
-
-
-def _listed(rows: Sequence[Row]) -> str:
-    return _names([row.method for row in rows])
 
 
 def _names(names: Sequence[str]) -> str:
