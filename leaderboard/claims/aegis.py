@@ -18,6 +18,7 @@ from .claim import (
     ANYWHERE,
     BOARDS,
     KNOWLEDGE,
+    WITH_LIBERO,
     Finding,
     Paper,
     claim,
@@ -298,7 +299,7 @@ def keeps_answers(evidence: Evidence) -> Finding:
     "mean share over steps and seeds is below 0.01; does not hold if the lower end is above 0.01.",
     settled="2026-11-23T07:13Z",
     margin="0.01 of the energy, the claim's own",
-    scenarios=(*BOARDS, *KNOWLEDGE),
+    scenarios=(*WITH_LIBERO, *KNOWLEDGE),
 )
 def sheds_little(evidence: Evidence) -> Finding:
     """Sheds less than 1 % of the gradient's energy on average."""

@@ -38,6 +38,9 @@ BOARDS = ("clbench/Fetch-v1", "clbench/MetaWorld-v1", "clbench/PointMaze-v1")
 """Scenarios at equal learning, with runs at the scenario's learning rate and controls: most claims are judged
 on them."""
 
+WITH_LIBERO = (*BOARDS, "clbench/LiberoSpatial-v1")
+"""The same, and the scenario nearest to ConSFT's own setting, without the controls of Fast-dVLA's claims."""
+
 ANYWHERE = BOARDS[:1]
 """Scenario of the claims that do not depend on one, such as the time of a step."""
 

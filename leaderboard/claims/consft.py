@@ -23,7 +23,7 @@ from .arms import (
 )
 from .claim import (
     ANYWHERE,
-    BOARDS,
+    WITH_LIBERO,
     Finding,
     Paper,
     Verdict,
@@ -51,9 +51,6 @@ from .figures import (
 )
 
 CONSFT = Paper("ConSFT", ("2605.08879",))
-
-WITH_LIBERO = (*BOARDS, "clbench/LiberoSpatial-v1")
-"""Scenarios of the claims about kept skills: the last one is close to the setting of the paper."""
 
 
 @claim(
