@@ -7,6 +7,7 @@ import json
 import sys
 import types
 from collections.abc import Callable, Iterator, Mapping
+from importlib.metadata import entry_points, packages_distributions
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import torch
 from helpers import complete_record
 from rich.console import Console
 
+from clbench.base import source
 from clbench.jobs.bars import Bars
 from clbench.learning.method import Method
 from clbench.learning.optimise import deterministic
@@ -27,7 +29,6 @@ from clbench.records.record import (
     AnswerRow,
     CheckRow,
     Costs,
-    EpisodeRow,
     PolicyRow,
     Record,
     Relearning,
@@ -35,10 +36,12 @@ from clbench.records.record import (
     ScenarioInfo,
 )
 from clbench.records.writer import record_text
+from clbench.runs import fingerprint
 from clbench.runs.length import run_length
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.scoring.scores import Scores
+from clbench.spec import identifiers
 from clbench.spec.identifiers import built_in_methods
 from clbench.spec.protocol import check_steps
 from clbench.worlds import gl_backend
@@ -70,6 +73,22 @@ def _short_measurements() -> Iterator[None]:
     """Measure the time of a step with two pairs of blocks: test_step_time.py has all five."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("clbench.runs.step_time.ROUNDS", 2)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _what_is_installed_is_listed_once() -> Iterator[None]:
+    """Keep the lists of packages, entry points and our files: each run and each board would make them."""
+    files_of, root = source.files_below, Path(source.__file__).resolve().parents[2]
+    once = functools.cache(files_of)
+
+    def files_below(folder: Path) -> list[Path]:
+        return once(folder) if folder.is_relative_to(root) else files_of(folder)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(source, "files_below", files_below)
+        patch.setattr(fingerprint, "packages_distributions", functools.cache(packages_distributions))
+        patch.setattr(identifiers, "entry_points", functools.cache(entry_points))
         yield
 
 
@@ -273,7 +292,7 @@ def _make_record(
     counts = {"skill": retained, "target": targets, "unseen": held_out}
     names = [f"{group}_{number}" for group, count in counts.items() for number in range(count)]
     method = run.get("method", "sft")
-    uses = dataclasses.asdict(load_method(method).uses if method in built_in_methods() else Uses())
+    uses = dict(_uses_of(method))
     names_of_run = {"scenario": "clbench/Toy-v0", "method": method, "seed": 0, "device": "cpu"}
     run = {**names_of_run, "split": "test", "settings": {}, "changes": {}, "uses": uses, **run}
     split, on_the_way = run["split"], curve_episodes or outcomes.shape[2]
@@ -341,8 +360,8 @@ def _make_record(
         },
         relearning=relearning,
     )
-    for row in rows:
-        record.add_episode(EpisodeRow(*row))
+    for column, values in zip(record.episodes.values(), zip(*rows, strict=True), strict=True):
+        column += values
     for (stage, kind), value in given.items():
         record.add_answers(AnswerRow(stage, at_end[stage], kind, *value))
     for stage, end in enumerate(ends or (), 1):
@@ -355,6 +374,11 @@ def _make_record(
     if complete:
         complete_record(record)
     return record
+
+
+@functools.cache  # 1 ms for each of 3,000 records
+def _uses_of(method: str) -> dict[str, Any]:
+    return dataclasses.asdict(load_method(method).uses if method in built_in_methods() else Uses())
 
 
 def _outcomes(values: Any, axes: int, episodes: int) -> Any:

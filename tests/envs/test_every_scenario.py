@@ -165,8 +165,8 @@ def test_it_takes_two_hundred_random_steps(scenario: Scenario) -> None:
 @every_task
 def test_an_episode_repeats_itself_whatever_ran_before(task: Task) -> None:
     world, expected = make(task), rollout(make(task), task.name, seed=7)
-    others = [name for entry_point, name in TASKS if entry_point == task.world][-2:]
-    for other, seed in (*itertools.product(others, (1, 7)), (task.name, 2)):
+    others = [name for entry_point, name in TASKS if entry_point == task.world and name != task.name][-2:]
+    for other, seed in (*zip(others, (1, 7), strict=False), (task.name, 2)):
         rollout(world, other, seed, steps=31)
         np.testing.assert_array_equal(rollout(world, task.name, seed=7), expected)
     assert not np.array_equal(rollout(world, task.name, seed=8), expected)

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import shutil
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -26,10 +27,17 @@ TASK = TOY.task("right")
 CAMERA = "clbench.testing.toy_camera:ToyCamera"
 
 
+@pytest.fixture(scope="module")
+def export(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of one task of the toy, which no test changes."""
+    folder = tmp_path_factory.mktemp("export") / "out"
+    return export_demonstrations(TOY, folder, format="hdf5", tasks=["right"]) / "right_demo.hdf5"
+
+
 @pytest.fixture
-def exported(tmp_path: Path) -> Path:
-    """The file of one task of the toy."""
-    return export_demonstrations(TOY, tmp_path / "out", format="hdf5", tasks=["right"]) / "right_demo.hdf5"
+def exported(export: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copy(export, tmp_path))
 
 
 @pytest.fixture

@@ -37,6 +37,20 @@ def test_what_takes_no_time_does_not_shorten_the_time_left() -> None:
     assert file.getvalue().splitlines()[-1] == " 10%, about 4:30 left: sft seed 1"
 
 
+def test_of_a_piece_that_ends_at_once_only_the_part_that_was_left_does_not_count() -> None:
+    now = 0.0
+    file = io.StringIO()
+    with Bars(100, Console(file=file, width=100), clock=lambda: now) as bars:
+        bars.start("sft seed 0", 60)
+        bars.advance("sft seed 0", 20)
+        bars.finish("sft seed 0", "done")
+        bars.start("sft seed 1", 40)
+        now += LINE_SECONDS
+        bars.advance("sft seed 1", 10)
+    # 20 and 10 of the 60 that count
+    assert file.getvalue().splitlines()[-1] == " 50%, about 0:30 left: sft seed 1"
+
+
 def test_no_time_left_is_shown_before_any_work_is_done() -> None:
     now = 0.0
     file = io.StringIO()
@@ -52,19 +66,19 @@ def test_the_time_left_is_told_from_one_per_cent_on_and_has_hours() -> None:
     file = io.StringIO()
     with Bars(1000, Console(file=file, width=100), clock=lambda: now) as bars:
         bars.start("a", 1000)
-        for amount in (9, 1):
+        for amount in (9, 1, 1000):  # more than the length, which is an estimate
             now += 2 * LINE_SECONDS
             bars.advance("a", amount)
-    assert file.getvalue() == "  1%: a\n  1%, about 3:18:00 left: a\n"
+    assert file.getvalue() == "  1%: a\n  1%, about 3:18:00 left: a\n100%, about 0:00 left: a\n"
 
 
 def test_a_terminal_shows_bars_with_the_time_left() -> None:
     file = io.StringIO()
     with Bars(100, Console(file=file, width=100, force_terminal=True)) as bars:
-        bars.start("sft seed 0", 100)
-        bars.advance("sft seed 0", 40)
+        bars.start("sft [seed 0]", 100)
+        bars.advance("sft [seed 0]", 40)
     text = file.getvalue()
-    assert "sft seed 0" in text
+    assert "sft [seed 0]" in text
     assert "40%" in text
     assert "left" in text
 
@@ -95,11 +109,11 @@ def test_a_bar_and_a_line_say_where_a_run_is() -> None:
         clock = itertools.count(step=2 * LINE_SECONDS)
         console = Console(file=file, width=140, force_terminal=is_terminal)
         with Bars(100, console, lambda clock=clock: next(clock)) as bars:  # type: ignore[misc]
-            bars.start("sft seed 0", 100)
-            bars.place("sft seed 0", "stage 2 (push) 17/20 after 32 steps")
-            bars.advance("sft seed 0", 50)
+            bars.start("sft [seed 0]", 100)
+            bars.place("sft [seed 0]", "stage 2 (push) 17/20 after 32 steps")
+            bars.advance("sft [seed 0]", 50)
     for text in (terminal.getvalue(), lines.getvalue()):
-        assert "sft seed 0, stage 2 (push) 17/20 after 32 steps" in text
+        assert "sft [seed 0], stage 2 (push) 17/20 after 32 steps" in text
 
 
 def test_work_that_only_waits_is_shown_without_a_terminal() -> None:

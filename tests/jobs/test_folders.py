@@ -7,7 +7,7 @@ import pytest
 from helpers import lose_home
 
 from clbench.base.errors import InputError
-from clbench.jobs.folders import check_folders
+from clbench.jobs.folders import absolute_places, check_folders
 from clbench.records.paths import record_path
 
 
@@ -30,6 +30,14 @@ def test_a_link_that_leads_to_itself_is_named(below: str, empty_caches: Path) ->
         InputError, match=rf"--records {re.escape(str(folder))} cannot be written to: {reason}"
     ):
         check_folders({"--records": folder})
+
+
+def test_only_places_that_are_set_are_made_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, place in (("HOME", "/home/me"), ("CLBENCH_CACHE", "~/c"), ("MINARI_DATASETS_PATH", "data")):
+        monkeypatch.setenv(name, place)
+    monkeypatch.setenv("XDG_CACHE_HOME", "")  # as if it was unset
+    assert absolute_places() == {"CLBENCH_CACHE": "/home/me/c", "MINARI_DATASETS_PATH": f"{tmp_path}/data"}
 
 
 def test_a_user_without_a_home_folder_is_told_which_folders_to_name(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
+from eager import EAGER
 from tiny import TINY
 
 from clbench.jobs import forecast as module
@@ -57,6 +59,15 @@ def test_the_time_of_runs_on_a_gpu_is_said_to_be_that_of_the_cpu(monkeypatch: py
     assert time == "Time: about 1 minute with 1 at once, at 60 ms for an optimiser step on this CPU."
 
 
+def test_it_is_said_that_stages_may_end_early_if_those_of_one_scenario_may(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "step_seconds", lambda _: 0.06)
+    for runs, early in ((RUNS, False), ([*RUNS, RunSpec(EAGER.id, "sft", 0).resolve()], True)):
+        _, time, _ = forecast(_plan(_job(work.do_run, 1000)), runs, 1, None)
+        assert ("; a stage ends as soon as its target is learned" in time) == early
+
+
 def test_more_workers_do_not_shorten_the_longest_chain(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "step_seconds", lambda _: 0.06)
     pretraining = _job(work.pretrain, 3000)
@@ -69,15 +80,16 @@ def test_more_workers_do_not_shorten_the_longest_chain(monkeypatch: pytest.Monke
 @pytest.mark.parametrize(
     ("own", "minutes"),
     [
-        (0.6, 10 + 100 + 100),  # a slow policy does not slow the simulator down that collects data
-        (0.006, 10 + 1 + 10),  # a fast one does not speed its episodes up
+        (0.6, 10 + 100 + 100 + 100),  # a slow policy does not slow the simulator down that collects data
+        (0.006, 10 + 1 + 1 + 10),  # a fast one does not speed its episodes up
     ],
 )
 def test_the_simulator_takes_as_long_whatever_the_policy(
     own: float, minutes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "step_seconds", lambda scenario: 0.06 if scenario.policy == "flow" else own)
-    jobs = [_job(function, 10_000) for function in (work.collect_demonstrations, work.pretrain, work.do_run)]
+    functions = (work.collect_demonstrations, work.pretrain, work.make_policies, work.do_run)
+    jobs = [_job(function, 10_000) for function in functions]
     runs = [RunSpec(TINY.id, "sft", 0, policy="discrete_diffusion").resolve()]
     _, time, _ = forecast(_plan(*jobs), runs, 1, None)
     hours = f"{minutes / 60:.1f} hours"
@@ -93,10 +105,12 @@ def test_the_disk_is_that_of_policies_demonstrations_and_records(monkeypatch: py
     # four numbers more
     demonstrations = 4 * 5 * 12 * 4 * (4 + 3 * 2 + 4)
     jobs = [_job(work.pretrain, 1), _job(work.pretrain, 1), *(_job(work.do_run, 1) for _ in range(3))]
-    to_do, _, disk = forecast(_plan(*jobs), RUNS, 1, Path("kept"))
+    to_do, _, disk = forecast(_plan(*jobs), RUNS, 8, Path("kept"))
     assert to_do == "To do: 2 policies to pretrain, 3 runs."
     made, kept = 2 * bytes_of_policy + demonstrations, 2 * 3 * bytes_of_policy  # after 0, 1 and 2 targets
-    meanwhile = 2 * bytes_of_policy  # the checkpoint of a stage, and for a moment the one before
+    meanwhile = (
+        2 * 2 * bytes_of_policy
+    )  # of each run the checkpoint of a stage, and for a moment the one before
     sizes = (made, meanwhile, kept)
     words = [f"{count / 1e3:.0f} kB" if count < 1e6 else f"{count / 1e6:.0f} MB" for count in sizes]
     assert disk == (
@@ -107,9 +121,12 @@ def test_the_disk_is_that_of_policies_demonstrations_and_records(monkeypatch: py
 
 def test_the_disk_holds_the_pictures_of_demonstrations(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "step_seconds", lambda _: 0.1)
-    runs = [RunSpec("clbench.testing.seen_toy:clbench/SeenToy-v0", "sft", 0).resolve()]
+    run = RunSpec("clbench.testing.seen_toy:clbench/SeenToy-v0", "sft", 0).resolve()
+    more = dataclasses.replace(SEEN_TOY.retained[0], name="more")
+    scenario = dataclasses.replace(run.scenario, background=(more,))
+    runs = [dataclasses.replace(run, scenario=scenario)]
     _, _, disk = forecast(_plan(_job(work.do_run, 1)), runs, 1, None)
-    config, steps = policy_config(SEEN_TOY), sum(task.horizon for task in SEEN_TOY.tasks)
+    config, steps = policy_config(SEEN_TOY), sum(task.horizon for task in (*SEEN_TOY.tasks, more))
     numbers = 4 * (config.state_size + 3 * config.action_size + 4)
     data = (numbers + 3 * config.image_size**2) * SEEN_TOY.budget.demonstrations * steps
     assert disk.startswith(f"Disk: up to {data / 1e3:.0f} kB in the caches")
@@ -122,5 +139,11 @@ def test_the_time_of_a_step_is_the_median_without_the_first(monkeypatch: pytest.
     assert step_seconds(TINY) == (1 + STEPS) / 2
 
 
-def test_the_step_of_a_scenario_without_targets_is_timed() -> None:
-    assert step_seconds(dataclasses.replace(TINY, target=())) > 0
+def test_the_step_of_a_scenario_without_targets_is_timed_and_the_threads_stay_as_they_are() -> None:
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        assert step_seconds(dataclasses.replace(TINY, target=())) > 0
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)

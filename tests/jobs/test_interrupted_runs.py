@@ -6,11 +6,18 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers import printed
+
+from clbench.base import interrupts
+from clbench.jobs.bars import Bars
+from clbench.jobs.job import Event, Job
+from clbench.jobs.scheduler import run_jobs
 
 TOY = "clbench.testing:clbench/Toy-v0"
 MOMENTS = 50
@@ -43,6 +50,45 @@ def _is_gone(group: int) -> bool:
             return True
         time.sleep(0.05)
     return False
+
+
+class Swallows:
+    """A worker within which a library swallows Ctrl-C: it does one job at each look."""
+
+    def __init__(self) -> None:
+        self._job: Job | None = None
+
+    def free(self) -> int:
+        return 1 if self._job is None else 0
+
+    def start(self, job: Job) -> None:
+        self._job = job
+
+    def events(self) -> Iterator[Event]:
+        job, self._job = self._job, None
+        assert job is not None
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        yield Event(job, "done", "went well")
+
+    def close(self) -> None:
+        pass
+
+
+def test_no_job_starts_after_a_ctrl_c_that_a_library_has_swallowed(
+    bars: Bars, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
+    before = signal.getsignal(signal.SIGINT)
+    interrupts.install()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_jobs([Job("first", str, {}, 1.0), Job("second", str, {}, 1.0)], Swallows(), bars)
+    finally:
+        interrupts.install(())  # forgets the signal
+        signal.signal(signal.SIGINT, before)
+    assert printed(bars).startswith("first: went well")
+    assert "second" not in printed(bars)
 
 
 @pytest.mark.slow

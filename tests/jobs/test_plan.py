@@ -60,6 +60,30 @@ def test_a_job_takes_no_function_of_its_command_to_another_machine(tmp_path: Pat
         bare = job.bare()
         assert (bare.title, bare.function, bare.arguments) == (job.title, job.function, job.arguments)
         assert [name for name, value in vars(bare).items() if callable(value)] == ["function"]
+        assert (bare.needs, bare.product) == ((), None)
+
+
+def test_a_plan_begins_with_the_job_that_all_others_wait_for(tmp_path: Path, empty_caches: Path) -> None:
+    check = Job("check", str, {}, 1.0)
+    plan = Plan(check)
+    plan.add_run(RunSpec(TINY.id, "joint", 0).resolve(), tmp_path)
+    first, *others = plan.jobs
+    assert first is check
+    assert all(job.needs for job in others)  # so that each waits for it, perhaps through others
+
+
+def test_folders_travel_to_other_processes_as_absolute_paths(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run, plan = RunSpec(TINY.id, "sft", 0).resolve(), Plan()
+    job = plan.add_run(run, Path("records"), checkpoints=Path("kept"), tensorboard=Path("logs"))
+    stages = plan.add_stages(run, Path("kept"))
+    names = {"records": "records", "checkpoints": "kept", "tensorboard": "logs"}
+    assert job.arguments == {"spec": run.spec, **{name: tmp_path / place for name, place in names.items()}}
+    assert stages.arguments == {"spec": run.spec, "checkpoints": tmp_path / "kept"}
+    assert stages.product is not None
+    assert stages.product.path.is_relative_to(tmp_path / "kept")
 
 
 @pytest.mark.parametrize("part", ["world", "expert"])
@@ -114,6 +138,14 @@ def test_a_method_that_watches_the_pretraining_takes_as_many_steps_more(
     length = run_length(run.scenario, run.protocol)
     assert _job(tmp_path, TINY.id, "sft").length == length
     assert _job(tmp_path, TINY.id, "watching_method:Watching").length == length + 10
+
+
+@pytest.mark.parametrize(("method", "reads"), [("sft", False), ("buffered_replay", True), ("joint", True)])
+def test_a_run_waits_for_the_demonstrations_of_skills_if_its_method_reads_them_at_any_time(
+    method: str, reads: bool, tmp_path: Path
+) -> None:
+    titles = {job.title for job in _job(tmp_path, TINY.id, method).needs}
+    assert all((f"me--Tiny-v0 demonstrations {task.name}" in titles) == reads for task in TINY.retained)
 
 
 def test_a_pretraining_is_as_long_as_its_steps(tmp_path: Path, empty_caches: Path) -> None:
@@ -207,14 +239,15 @@ def test_runs_share_the_evaluation_of_a_start_only_if_it_is_the_same(
 
     assert starts({}, {}) == 1
     assert starts({"perturb": True}, {"perturb": True}) == 1
-    for other in ({"perturb": True}, {"split": "validation"}, {"order": 1}, {"targets": 1}):
+    others = ({"perturb": True}, {"split": "validation"}, {"order": 1}, {"targets": 1}, {"device": "cuda"})
+    for other in others:
         assert starts({}, other) == 2
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
 def test_a_run_for_a_gpu_of_a_cluster_is_planned_on_a_machine_without_one(tmp_path: Path) -> None:
     (start, run) = _plan(tmp_path, RunSpec("clbench/Fetch-v1", "sft", 0, device="cuda"))[-2:]
-    assert start.title == "Fetch-v1 evaluation of the pretrained policy seed 0"
+    assert (start.title, start.device) == ("Fetch-v1 evaluation of the pretrained policy seed 0", "cuda")
     assert (run.title, run.device) == ("Fetch-v1 sft seed 0", "cuda")
 
 

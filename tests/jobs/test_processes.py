@@ -17,8 +17,9 @@ import pytest
 from helpers import printed
 
 from clbench.base.cache import cache_folder, minari_folder
+from clbench.base.progress import announce
 from clbench.jobs.bars import Bars
-from clbench.jobs.job import Job, Product
+from clbench.jobs.job import Event, Job, Product
 from clbench.jobs.processes import Here, Processes, at_once
 from clbench.jobs.scheduler import run_jobs
 from clbench.spec.limits import Limits
@@ -127,12 +128,14 @@ def test_closing_ends_a_job_that_ignores_it_and_its_children(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("clbench.jobs.processes.CLOSE_SECONDS", 0.2)
+    suspends = signal.getsignal(signal.SIGTSTP)
     path, workers = tmp_path / "pids", Processes(1)
     workers.start(_job("stubborn", path=str(path)))
     while not (path.exists() and path.read_text()):
         time.sleep(0.05)
     workers.close()
     assert all(_is_gone(int(pid)) for pid in path.read_text().split())
+    assert (workers.free(), signal.getsignal(signal.SIGTSTP)) == (1, suspends)
 
 
 def test_a_job_may_start_processes_of_its_own(bars: Bars) -> None:
@@ -149,6 +152,17 @@ def test_an_interrupt_or_a_cancellation_that_a_job_raises_is_its_failure(
 ) -> None:
     (reason,) = run_jobs([_job(function)], workers(), bars).values()
     assert reason.startswith(f"{error}: of its own")
+
+
+def test_what_is_announced_after_a_job_of_this_process_is_no_place_of_the_job() -> None:
+    workers = Here()
+    for job in (_job("interrupts"), _job("cancels")):
+        workers.start(job)
+        found = list[Event]()
+        while not (found and found[-1].ends_job):
+            found += workers.events()
+        assert [event.job for event in found] == [job]
+        announce("elsewhere")
 
 
 def test_a_job_that_moves_finds_the_folders_of_data_where_they_were(
@@ -206,10 +220,14 @@ def test_leases_are_given_back_if_closing_is_interrupted(tmp_path: Path, bars: B
             raise SystemExit
 
     job = _job("has_a_helper")
-    claimed = Job(job.title, job.function, {}, 1, product=Product(tmp_path / "made", lambda: False))
-    with pytest.raises(SystemExit):
-        run_jobs([claimed], Interrupted(1), bars)
-    assert not list(tmp_path.glob(".made.*"))
+    claimed = [
+        Job(job.title, job.function, {}, 1, product=Product(tmp_path / name, lambda: False))
+        for name in ("made", "made too")
+    ]
+    with pytest.raises(SystemExit) as stopped:  # its traceback keeps the leases from the garbage collector
+        run_jobs(claimed, Interrupted(2), bars)
+    assert not list(tmp_path.glob(".made*"))
+    assert stopped.value.code is None
 
 
 SUSPENDED = """

@@ -59,6 +59,27 @@ def test_a_job_that_is_left_out_is_named_and_counts_as_settled(monkeypatch: pyte
     assert lines[-1].startswith("100%")
 
 
+def test_jobs_that_are_left_out_are_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    wrong = Job("wrong", str, {}, 60.0)
+    jobs = [wrong, *(Job(f"hopeless {number}", str, {}, 10.0, (wrong,)) for number in range(3))]
+    lines = _lines(jobs, Scripted(wrong=["failed"]), monkeypatch)
+    assert not any("waiting for" in line for line in lines)
+
+
+def test_a_job_without_events_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Silent(Scripted):
+        """A worker that says nothing at its first look."""
+
+        looks = 0
+
+        def events(self) -> Iterator[Event]:
+            self.looks += 1
+            return iter(()) if self.looks == 1 else super().events()
+
+    first, *_ = _lines([Job("patient", str, {}, 10.0)], Silent(), monkeypatch)
+    assert first == "  0%: patient"
+
+
 def test_a_job_that_another_process_takes_over_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
     jobs = [Job("taken", str, {}, 110.0), Job("other", str, {}, 90.0)]
     lines = _lines(jobs, Scripted(taken=["taken", "done"]), monkeypatch)

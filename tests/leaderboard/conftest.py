@@ -1,7 +1,8 @@
 """Folders of records: four methods with fixed stages, and any number of them at equal learning."""
 
+import ast
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from clbench.base.entry_points import resolve
 from clbench.records.paths import label_of, record_path
 from clbench.records.record import Record
 from clbench.records.writer import record_text
+from clbench.scoring.intervals import estimate, estimate_quantity, paired_difference
 from clbench.spec.scenario import balanced_order
 
 EVEN = "clbench/Even-v1"
@@ -20,6 +22,29 @@ VALIDATION = [[0.3, 0.6, 0.9, 0.9], [0.1, 0.3, 0.8, 0.8]]
 REFERENCE = {"demonstrations": "never", "questions": "never", "reference": True}
 REPLAY = {"demonstrations": "throughout", "questions": "never", "reference": False}
 ASKS = {"demonstrations": "never", "questions": "prepare", "reference": False}
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _docstrings_are_read_once() -> Iterator[None]:
+    """Keep the docstrings of the source: each board and each page of a method would read them again."""
+    docstrings_in = resolve("clbench.leaderboard.publishing:_docstrings_in")
+    fields_of = resolve("clbench.leaderboard.views.descriptions:field_docstrings")
+    kept = functools.cache(lambda path, _: docstrings_in(path))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "clbench.leaderboard.publishing._docstrings_in", lambda path: kept(path, ast.get_docstring)
+        )
+        patch.setattr("clbench.leaderboard.views.descriptions.field_docstrings", functools.cache(fields_of))
+        yield
+
+
+@pytest.fixture(autouse=True)
+def _few_draws(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw episodes of made-up records 200 times, not 2,000; tests of published ones are long or slow."""
+    if not any(request.node.get_closest_marker(name) for name in ("long", "slow")):
+        for function in (estimate, estimate_quantity, paired_difference):
+            defaults = {**(function.__kwdefaults__ or {}), "replicates": 200}
+            monkeypatch.setattr(function, "__kwdefaults__", defaults)
 
 
 @pytest.fixture

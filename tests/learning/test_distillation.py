@@ -11,6 +11,7 @@ from clbench.learning.distillation import (
     with_blocks,
 )
 from clbench.learning.pretraining import pretrained_policy
+from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
 from clbench.testing.toy import TOY
 
@@ -100,7 +101,16 @@ def test_the_student_comes_close_to_its_teacher_which_does_not_change(
     assert all(parameter.requires_grad for parameter in student.parameters())
 
 
-def test_distillation_repeats_itself(teacher: Policy, demonstrations: Demonstrations) -> None:
+def test_distillation_repeats_itself(
+    teacher: Policy, demonstrations: Demonstrations, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sample, deterministic = Demonstrations.sample, set[bool]()
+
+    def watched(self: Demonstrations, count: int, generator: torch.Generator) -> Batch:
+        deterministic.add(torch.are_deterministic_algorithms_enabled())
+        return sample(self, count, generator)
+
+    monkeypatch.setattr(Demonstrations, "sample", watched)
     students = [
         distilled(teacher, demonstrations, TOY.budget, torch.Generator().manual_seed(3), block=2)
         for _ in range(2)
@@ -108,6 +118,7 @@ def test_distillation_repeats_itself(teacher: Policy, demonstrations: Demonstrat
     first, second = (student.state_dict() for student in students)
     assert all(value.equal(second[name]) for name, value in first.items())
     assert students[0].config.block == 2
+    assert deterministic == {True}
 
 
 def test_a_policy_without_tokens_has_no_students() -> None:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import pytest
 import torch
 from helpers import build_method
@@ -107,6 +108,14 @@ class Chooses(Method):
 
 
 @dataclasses.dataclass
+class Scales(Method):
+    """A method with a number that may be whole, and a choice that may be left out."""
+
+    scale: int | float = 1
+    mode: Literal["slow", "fast"] | None = "slow"
+
+
+@dataclasses.dataclass
 class Counts(Chooses):
     """A method with a counter, which nobody sets."""
 
@@ -121,6 +130,24 @@ def test_a_field_that_nobody_sets_is_no_hyper_parameter(stranger: Callable[[type
 def test_a_choice_and_a_list_are_read_from_the_command_line(stranger: Callable[[type[Method]], str]) -> None:
     method = build_method(stranger(Chooses), {"mode": "fast", "layers": "[1, 2]"})
     assert dataclasses.asdict(method) == {"step_factor": 1.0, "mode": "fast", "layers": [1, 2]}
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "held"),
+    [
+        ("scale", "2", 2),
+        ("scale", "2.5", 2.5),
+        ("scale", np.int64(2), 2),
+        ("scale", np.float64(2), 2.0),
+        ("mode", None, None),
+        ("mode", "None", None),
+    ],
+)
+def test_a_value_of_a_union_keeps_its_own_type(
+    name: str, given: Any, held: Any, stranger: Callable[[type[Method]], str]
+) -> None:
+    found = getattr(build_method(stranger(Scales), {name: given}), name)
+    assert (type(found), found) == (type(held), held)
 
 
 @pytest.mark.parametrize(("name", "value"), [("mode", "quick"), ("mode", 3)])
@@ -157,6 +184,8 @@ def test_a_list_with_an_item_of_another_type_is_refused_by_name(
         ({"rounds": 2.5}, ValueError, "rounds must be a whole number, not 2.5"),
         ({"rounds": True}, ValueError, "rounds must be a whole number, not True"),
         ({"strength": None}, ValueError, "strength must be a number, not None"),
+        ({"step_factor": 0.0}, ValueError, "step_factor must be a number above 0, not 0.0"),
+        ({"step_factor": "inf"}, ValueError, "step_factor must be a number above 0, not inf"),
         ({"gentle": "perhaps"}, ValueError, "gentle must be true or false, not 'perhaps'"),
     ],
 )

@@ -6,7 +6,14 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from clbench.learning.optimise import MethodError, deterministic, learning_rate_factor, optimise, warm_up
+from clbench.learning.optimise import (
+    MethodError,
+    deterministic,
+    learning_rate_factor,
+    optimise,
+    steps_counted,
+    warm_up,
+)
 
 
 def test_the_learning_rate_warms_up_and_then_follows_a_cosine_down_to_a_tenth() -> None:
@@ -96,6 +103,35 @@ def test_without_parameters_no_step_is_done_but_the_callback_is_called_for_each(
     assert seen == [1, 2, 3]
 
 
+@pytest.mark.parametrize("trains", [True, False])
+def test_training_ends_after_the_step_whose_callback_says_so(trains: bool) -> None:
+    weight = nn.Parameter(torch.ones(2))
+    seen: list[int] = []
+
+    def after(step: int) -> bool:
+        seen.append(step)
+        return step == 2
+
+    steps = optimise([weight] if trains else [], 0.1, 5, lambda _: weight.square().sum(), after=after)
+    assert (steps, seen) == (2 if trains else 0, [1, 2])
+
+
+def test_a_weight_that_the_loss_does_not_reach_stays_as_it_is() -> None:
+    reached, other = nn.Parameter(torch.ones(2)), nn.Parameter(torch.ones(2))
+    assert optimise([reached, other], 0.1, 2, lambda _: reached.square().sum()) == 2
+    assert other.tolist() == [1.0, 1.0]
+    assert reached.max() < 1.0
+
+
+def test_steps_are_counted_until_the_block_ends() -> None:
+    weight = nn.Parameter(torch.ones(2))
+    with steps_counted() as taken:
+        optimise([weight], 0.1, 3, lambda _: weight.square().sum())
+        assert taken() == 3
+    optimise([weight], 0.1, 2, lambda _: weight.square().sum())
+    assert taken() == 3
+
+
 @pytest.mark.parametrize(
     ("loss", "message"),
     [
@@ -174,6 +210,12 @@ def test_the_learning_rate_can_change_at_every_step_once_the_gradient_is_known()
     optimise([weight], 0.1, 2, lambda _: (weight - 1).square().sum(), rate=rate)
     assert seen == [(0.1, 0, True), (pytest.approx(0.1), 1, True)]
     assert weight.item() == pytest.approx(0.1, rel=1e-2)  # two Adam steps of half of 0.1
+
+
+def test_a_learning_rate_of_0_is_a_step_that_changes_nothing() -> None:
+    weight = nn.Parameter(torch.zeros(1))
+    assert optimise([weight], 0.1, 1, lambda _: (weight - 1).square().sum(), rate=lambda *_: 0.0) == 1
+    assert weight.item() == 0.0
 
 
 @pytest.mark.parametrize("rate", [-0.1, float("nan"), float("inf"), "0.1"])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from clbench.base.errors import InputError
-from clbench.learning.prior import Source, UndeclaredAccessError, Uses, twin_of
+from clbench.learning.prior import Prior, Source, UndeclaredAccessError, Uses, begin_step, twin_of
 
 
 class Numbers:
@@ -40,6 +40,23 @@ def test_a_twin_closes_with_its_source() -> None:
     source.close()
     with pytest.raises(UndeclaredAccessError, match="after the hooks that received it"):
         twin.sample(1)
+
+
+def test_prior_data_close_together() -> None:
+    sources = {name: Source(numbers(), torch.Generator(), 4) for name in ("demonstrations", "questions")}
+    Prior(sources).close()
+    for source in sources.values():
+        with pytest.raises(UndeclaredAccessError, match="after the hooks that received it"):
+            source.sample(1)
+
+
+def test_what_a_step_leaves_is_not_carried_over_to_the_next_one() -> None:
+    source = Source(numbers(), torch.Generator(), 4)
+    for count in (3, 4, 1):
+        begin_step(source)
+        source.sample(count)
+    with pytest.raises(UndeclaredAccessError, match="draws 5 samples of the target in a step"):
+        source.sample(4)
 
 
 def test_a_negative_number_of_samples_is_refused_and_buys_no_others() -> None:

@@ -118,6 +118,7 @@ def test_the_arithmetic_is_the_same_with_any_number_of_threads() -> None:
         torch.set_num_threads(threads)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(
     torch.backends.cpu.get_cpu_capability() == "DEFAULT",
     reason="PyTorch has no other code here",

@@ -114,6 +114,7 @@ def test_the_examples_of_the_page_give_its_results() -> None:
         assert (f"{got:.2f}" if isinstance(got, float) else str(got)) == result
 
 
+@pytest.mark.long
 def test_its_script_prints_the_paired_interval_that_the_page_shows(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,9 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 from served import serving, write_policy
-from websockets.http11 import Request
-from websockets.protocol import State
-from websockets.server import ServerProtocol
 from websockets.sync.server import ServerConnection, serve
 
 from clbench.base.errors import InputError
@@ -29,9 +26,9 @@ OBSERVATIONS = {
 
 
 @contextmanager
-def answering(handle: Callable[[ServerConnection], None]) -> Iterator[str]:
+def answering(handle: Callable[[ServerConnection], None], **options: Any) -> Iterator[str]:
     """Run a server of its own manners in a thread, and yield its address."""
-    with serve(handle, "localhost", 0) as server:
+    with serve(handle, "localhost", 0, **options) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         try:
@@ -100,13 +97,14 @@ def test_a_server_that_comes_back_with_another_checkpoint_ends_the_stage() -> No
             served(OBSERVATIONS)
 
 
-def test_nobody_at_the_address_is_an_error_that_says_what_to_do() -> None:
+def test_nobody_at_the_address_is_an_error_that_says_what_to_do(caplog: pytest.LogCaptureFixture) -> None:
     with socket.create_server(("localhost", 0)) as free:
         port = free.getsockname()[1]
     with pytest.raises(
         InputError, match=rf"No policy answers at ws://localhost:{port}: .*refused.*Start its"
     ):
-        ServedPolicy(f"ws://localhost:{port}", patience=0.3)
+        ServedPolicy(f"ws://localhost:{port}", patience=0.5)
+    assert caplog.text.count("Waiting for the policy") == 1  # of several attempts
 
 
 @pytest.mark.long
@@ -303,45 +301,24 @@ def test_a_message_that_no_request_asked_for_is_not_taken_for_a_reply(extra: str
             served(OBSERVATIONS)
 
 
-def test_a_request_that_no_server_would_read_is_refused_before_it_is_sent(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("clbench.serving.client.LARGEST_MESSAGE", 2 * 2**20)
-    pictures = {**OBSERVATIONS, "pictures/wrist": np.zeros((40, 200, 200, 3), np.uint8)}
-    with guarded() as place:
-        served = ServedPolicy(f"ws://{place}")
-        with pytest.raises(InputError, match="take 5 MB, and the limit is 2 MB: choose a smaller --pict"):
-            served(pictures)
-        assert served(OBSERVATIONS).shape == (2, 1, 4)
-        served.close()
+def test_a_reply_that_comes_too_late_is_not_taken_for_the_next_one() -> None:
+    given_up, numbers = threading.Event(), iter((1, 2))
 
+    def handle(connection: ServerConnection) -> None:
+        greet(connection)
+        number = next(numbers)
+        for _ in connection:
+            if number == 1:
+                given_up.wait(60)
+            connection.send(pack({"actions": np.full((2, 1, 4), number)}))
 
-@pytest.mark.long
-def test_a_server_that_does_not_read_a_large_request_is_an_error() -> None:
-    pictures = {**OBSERVATIONS, "image": np.zeros((40, 512, 512, 3), np.uint8)}  # 31 MB fill every buffer
-    with socket.create_server(("localhost", 0)) as listening:
-        thread = threading.Thread(target=greet_and_never_read, args=(listening,))
-        thread.start()
-        served = ServedPolicy(f"ws://localhost:{listening.getsockname()[1]}", timeout=0.5)
+    with answering(handle) as address:
+        served = ServedPolicy(address, timeout=0.5)
         with pytest.raises(InputError, match=r"did not answer within 0\.5 seconds"):
-            served(pictures)
+            served(OBSERVATIONS)
+        given_up.set()
+        assert (served(OBSERVATIONS) == 2).all()
         served.close()
-        thread.join()
-
-
-def greet_and_never_read(listening: socket.socket) -> None:
-    """Open one connection, send metadata, and read nothing until the client gives up."""
-    connection, _ = listening.accept()
-    protocol = ServerProtocol()
-    with connection:
-        while protocol.state is State.CONNECTING:
-            protocol.receive_data(connection.recv(4096))
-            for request in protocol.events_received():
-                assert isinstance(request, Request)
-                protocol.send_response(protocol.accept(request))
-        protocol.send_binary(pack({}))
-        connection.sendall(b"".join(protocol.data_to_send()))
-        time.sleep(3)
 
 
 @pytest.mark.parametrize(
@@ -358,6 +335,16 @@ def test_a_server_without_metadata_is_an_error(first: Any, message: str) -> None
         pytest.raises(InputError, match=message),
     ):
         ServedPolicy(address)
+
+
+def test_a_server_that_refuses_for_another_reason_than_the_token_is_waited_for() -> None:
+    with (
+        answering(
+            greet, process_request=lambda connection, _: connection.respond(503, "loading\n")
+        ) as address,
+        pytest.raises(InputError, match=r"No policy answers at .*HTTP 503"),
+    ):
+        ServedPolicy(address, patience=0.1)
 
 
 def test_a_program_that_speaks_before_the_handshake_is_no_server_of_a_policy() -> None:

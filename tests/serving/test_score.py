@@ -167,7 +167,9 @@ def test_each_episode_observes_a_seed_of_its_own(run: Callable[..., Record]) -> 
         seen.append(observations)
         return np.zeros((40, 12, 2))
 
-    run(act, 0)
+    progress: list[float] = []
+    run(act, 0, progress=progress.append)
+    assert sum(progress) == pytest.approx(1.0)  # the share of the stage
     (shown,) = seen
     assert (shown["state"].shape, shown["state"].dtype) == ((40, 4), np.float32)
     assert (shown["seed"].dtype, shown["step"].dtype) == (np.int64, np.int64)
@@ -339,6 +341,7 @@ def test_metadata_of_the_server_are_kept_if_they_are_texts_and_numbers(run: Call
         "rate": 1e-4,
         "nan": float("nan"),
         "too large": 10**400,
+        "a little too large": 2**63,
         "weights": np.zeros(1000),
         "nested": {"a": 1},
         "long": "x" * 1000,
@@ -357,12 +360,13 @@ def test_metadata_of_the_server_are_kept_if_they_are_texts_and_numbers(run: Call
 def test_a_server_that_says_the_same_as_in_the_stage_before_is_suspected(
     run: Callable[..., Record], caplog: pytest.LogCaptureFixture
 ) -> None:
-    for stage, checkpoint in ((0, "a"), (1, "b"), (2, "b")):
-        assert not caplog.messages
-        run(Describing(stage, {"checkpoint": checkpoint}), stage)
-    assert caplog.messages == [
+    for stage, checkpoint, again in ((0, "a", False), (1, "b", False), (1, "b", True), (2, "b", False)):
+        run(Describing(stage, {"checkpoint": checkpoint}), stage, restart=again)
+    dropped, message = caplog.messages
+    assert dropped.endswith("its stages 1 to 1 are dropped.")
+    assert message == (
         "The server sends the same metadata as in stage 1 (checkpoint b): does it serve the new checkpoint?"
-    ]
+    )
 
 
 def test_a_policy_that_repeats_all_episodes_of_the_stage_before_is_suspected(
@@ -380,14 +384,14 @@ def test_a_policy_that_repeats_all_episodes_of_the_stage_before_is_suspected(
 def test_a_checkpoint_that_was_scored_with_another_seed_is_no_second_training(
     run: Callable[..., Record], caplog: pytest.LogCaptureFixture
 ) -> None:
-    for seed, checkpoints in ((0, "abc"), (1, "ade"), (2, "ad")):  # all begin with one pretrained policy
+    for seed, checkpoints in ((0, "abc"), (1, "ad"), (2, "adc")):  # all begin with one pretrained policy
         for stage, checkpoint in enumerate(checkpoints):
-            assert not caplog.messages
             run(Describing(stage, {"checkpoint": checkpoint}), stage, seed=seed)
-    (message,) = caplog.messages
-    assert message.startswith(
-        "The server sends the same metadata as with seed 1 in this stage (checkpoint d)"
-    )
+    same = "The server sends the same metadata as with seed"
+    assert [message.partition(":")[0] for message in caplog.messages] == [
+        f"{same} 1 in this stage (checkpoint d)",  # its last stage is still to be scored
+        f"{same} 0 in this stage (checkpoint c)",
+    ]
 
 
 @pytest.mark.parametrize(

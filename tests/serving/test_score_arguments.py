@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from agents import ID
 
 from clbench.serving.score import score
@@ -82,6 +83,21 @@ def test_a_policy_with_a_memory_sees_every_step_of_an_episode_under_its_seed(tmp
     record = score(ID, act, stage=0, method="me/still", records=tmp_path)
     assert sorted(map(len, seen.values())) == sorted(record.episodes["length"])
     assert all(steps == list(range(len(steps))) for steps in seen.values())
+
+
+def test_what_a_policy_draws_at_random_repeats_itself_and_is_new_in_each_stage(tmp_path: Path) -> None:
+    drawn: list[float] = []
+
+    def act(observations: dict[str, Any]) -> Any:
+        drawn.append(float(torch.rand(1)))
+        return np.zeros((40, 12, 2))  # a whole episode
+
+    for method in ("me/still", "me/again"):
+        for stage in (0, 1):
+            score(ID, act, stage=stage, method=method, records=tmp_path)
+    first, second, *again = drawn
+    assert again == [first, second]
+    assert first != second
 
 
 def test_numbers_of_numpy_are_recorded_as_numbers(tmp_path: Path) -> None:

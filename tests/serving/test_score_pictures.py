@@ -31,6 +31,8 @@ def test_a_policy_gets_the_pictures_of_each_episode_and_the_record_keeps_which(
     monkeypatch.setattr(SimulatorCameras, "check", lambda *_: None)
     monkeypatch.setattr(SimulatorCameras, "draw", _drawn)
     seen: list[dict[str, Any]] = []
+    closed: list[tuple[str, ...]] = []
+    monkeypatch.setattr(SimulatorCameras, "close", lambda cameras: closed.append(cameras.names))
 
     def act(observations: dict[str, Any]) -> Any:
         seen.append(observations)
@@ -45,6 +47,7 @@ def test_a_policy_gets_the_pictures_of_each_episode_and_the_record_keeps_which(
         running = len({*rows.tolist()})
         assert len({*rows[:running].tolist()}) == running
         assert {*rows[running:].tolist()} <= {rows[0]}  # unused rows
+    assert closed == [("front", "wrist")]
     run(act, 0, method="me/blind")
     assert "pictures/front" not in seen[-1]
 

@@ -325,6 +325,7 @@ class LeRobotShaped:
         yield torch.zeros(1)
 
     def predict_action_chunk(self, batch: dict[str, Any], **noise: torch.Tensor) -> torch.Tensor:
+        assert not torch.is_grad_enabled()
         self.given += noise.values()
         state = batch["observation.state"][:, None, :2]
         chunks: torch.Tensor = state + torch.arange(5.0)[:, None] + self.noise * torch.randn(len(state), 5, 2)
@@ -349,20 +350,18 @@ def test_a_policy_of_lerobot_receives_its_batch_and_its_actions_are_processed_st
     assert (picture.shape, picture.dtype, picture.is_contiguous()) == ((2, 3, 4, 4), torch.float32, True)
     assert np.allclose(picture.numpy().transpose(0, 2, 3, 1) * 255, OBSERVATIONS["image"])
     act({name: values for name, values in OBSERVATIONS.items() if name != "image"})
-    assert set(policy.batches[1]) == {"observation.state", "observation.environment_state", "task"}
-    assert torch.equal(
-        policy.batches[1]["observation.environment_state"], policy.batches[1]["observation.state"]
-    )
+    _, second = policy.batches
+    assert set(second) == {"observation.state", "observation.environment_state", "task"}
+    assert torch.equal(second["observation.environment_state"], second["observation.state"])
 
 
 @pytest.mark.parametrize(("executed", "found"), [(3, 3), (9, 5)])
 def test_of_a_chunk_of_lerobot_as_many_actions_are_executed_as_lerobot_executes(
     executed: int, found: int
 ) -> None:
-    policy = LeRobotShaped(executed=executed)
-    whole = LeRobotShaped()
     actions, every = (
-        lerobot_policy(one, one.preprocess, one.postprocess)(OBSERVATIONS) for one in (policy, whole)
+        lerobot_policy(one, one.preprocess, one.postprocess)(OBSERVATIONS)
+        for one in (LeRobotShaped(executed=executed), LeRobotShaped())
     )
     assert actions.shape == (2, found, 2)
     assert np.array_equal(actions, every[:, :executed])
@@ -385,10 +384,12 @@ def test_noise_of_a_policy_of_lerobot_depends_on_the_seed_and_the_step_of_its_ep
         act(OBSERVATIONS)
         act({**OBSERVATIONS, "seed": np.array([7, 6])})  # another first episode
         act({**OBSERVATIONS, "step": np.array([0, 9])})
-    first, beside, later = policy.given
+        act({**OBSERVATIONS, "seed": np.array([0, 6]), "step": np.array([5, 8])})
+    first, beside, later, exchanged = policy.given
     assert (first.shape, first.dtype) == ((2, 5, 8), torch.float32)
     assert [first[row].equal(beside[row]) for row in (0, 1)] == [False, True]
     assert [first[row].equal(later[row]) for row in (0, 1)] == [True, False]
+    assert not first[0].equal(exchanged[0])
 
 
 class OpenpiShaped:
@@ -399,8 +400,7 @@ class OpenpiShaped:
 
     def infer(self, obs: dict[str, Any], *, noise: Any = None) -> dict[str, Any]:
         self.seen.append((obs, noise))
-        actions = np.tile(next(iter(obs.values()))[:2], (4, 1))
-        return {"actions": actions, "policy_timing": {"infer_ms": 1.0}}
+        return {"actions": np.tile(next(iter(obs.values()))[:2], (4, 1)), "policy_timing": {"infer_ms": 1.0}}
 
 
 def test_a_policy_of_openpi_infers_one_episode_after_another() -> None:

@@ -12,7 +12,7 @@ from clbench.base.entry_points import resolve
 from clbench.records.paths import label_of, record_path
 from clbench.records.reader import read_record
 from clbench.records.record import Record
-from clbench.records.writer import write_record
+from clbench.records.writer import record_text, write_record
 from clbench.spec.protocol import check_steps
 from clbench.testing import TOY
 
@@ -106,7 +106,8 @@ class Bench:
             if edit:
                 edit(record)
             path = record_path(self.folder / self.kind(label), SCENARIO, label_of(method, changed), seed)
-            write_record(record, path)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(record_text(record), encoding="utf-8")  # write_record would read it again
 
     def kind(self, label: str) -> str:
         return "ladder" if "@" in label else "controls" if "+" in label else "records"

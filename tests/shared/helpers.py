@@ -103,14 +103,15 @@ def resealed(content: bytes) -> bytes:
 def complete_record(record: Record) -> None:
     """Add what a record lacks of its budget."""
     protocol = read_protocol(record)
-    played = {(row.point, row.task, row.split, row.episode) for row in record.episode_rows()}
+    columns = (record.episodes[name] for name in ("stage", "step", "task", "split", "episode"))
+    played = set(zip(*columns, strict=True))
     moved = set(zip(record.policy["stage"], record.policy["step"], strict=True))
     answers = [AnswerRow(*row) for row in zip(*record.answers.values(), strict=True)]
     asked = sum(row.asked for row in answers if row.stage == 0)
     record.scenario.budget.setdefault("test_questions", asked)
     for point in (point for stage in protocol.stages for point in protocol.points(stage)):
         for key in protocol.episodes(point):
-            if (point, *key) not in played:
+            if (*point, *key) not in played:
                 record.add_episode(EpisodeRow(*point, key.task, key.split, key.number, 0, 0.0, 50))
         if point not in moved and not record.run.trained_elsewhere:
             record.add_policy(PolicyRow(*point, None, None, None, None))

@@ -316,16 +316,15 @@ def test_after_an_interruption_the_next_picture_is_that_of_its_own_state(
     observer.close()
 
 
-FORKED = """
+FORKED = f"""
 import os, signal, time
 import numpy as np
-from clbench.testing.seen_toy import SEEN_TOY
 from clbench.worlds import observation
 from clbench.worlds.observation import Observer
 
 observation.working_back_end = lambda *_: "egl"  # the toy draws by itself
 states = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 4)).astype(np.float32)
-observer = Observer(SEEN_TOY.target[0].world, SEEN_TOY.target[0].camera)
+observer = Observer({TASK.world!r}, {TASK.camera!r})
 _, expected = observer.observe(states)
 """
 

@@ -211,16 +211,18 @@ def test_of_arm_records_only_what_episodes_show_may_differ_and_a_refused_record_
         assert "Fetch-v1/sft/seed-0.json" not in flat(text)
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"a": 1}', '{"schema": 99}', "[" * 99_999, "\x00"])
 def test_a_file_that_is_no_record_is_listed_and_hides_no_other(
-    content: str, four_methods: Path, shown: Callable[[], tuple[str, str]]
+    four_methods: Path, shown: Callable[[], tuple[str, str]]
 ) -> None:
     before = table_of_four_methods(four_methods, shown)
-    (four_methods / "a_torn_*file*.json").write_text(content, encoding="utf-8")
+    contents = ["", "{", "[]", '{"a": 1}', '{"schema": 99}', "[" * 99_999, "\x00"]
+    for number, content in enumerate(contents):
+        (four_methods / f"a_torn_*file*{number}.json").write_text(content, encoding="utf-8")
     printed, page = shown()
     assert (four_methods.parent / "site" / "leaderboard.csv").read_bytes() == before
-    assert "a_torn_*file*.json: " in printed
-    assert r"a\_torn\_\*file\*.json: " in page
+    for number in range(len(contents)):
+        assert f"a_torn_*file*{number}.json: " in printed
+        assert rf"a\_torn\_\*file\*{number}.json: " in page
 
 
 def test_a_file_name_with_control_characters_is_shown_without_them(
