@@ -145,7 +145,7 @@ class _Leases:
         """
         taken: dict[Job, str | None] = {}
         for job in ready:
-            if len(taken) >= most:  # on a shrinking cluster, fewer than none are free
+            if len(taken) >= most:
                 break
             now = time.monotonic()
             if job in self._all and now - self._tried.get(job, -math.inf) < WAIT_SECONDS:

@@ -368,7 +368,7 @@ def _decode(values: dict[Any, Any]) -> Any:
         shape, data = values[b"shape"], values[b"data"]
         if min(shape, default=0) < 0:  # NumPy would choose a size for it
             raise ValueError(f"An array cannot have the shape {shape}.")
-        array = (np.frombuffer(data, dtype) if data else np.empty(0, dtype)).reshape(shape)
+        array = np.frombuffer(data, dtype).reshape(shape)
         # rows without values take no bytes, so that a short message may have any number of them
         if not array.size and math.prod(max(size, 1) for size in array.shape) > MOST_EMPTY_ROWS:
             raise ValueError(f"An array cannot have the shape {shape}.")

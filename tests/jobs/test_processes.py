@@ -47,6 +47,17 @@ def stubborn(progress, path):
     Path(path).write_text(f"{os.getpid()} {child.pid}")
     time.sleep(600)
 
+def goes_on(progress, path):
+    Path(path).write_text(str(os.getpid()))
+    for _ in range(3000):
+        progress(0.01)
+        time.sleep(0.05)
+
+def thirds(progress):
+    for _ in range(3):
+        progress(0.25)
+    return "went well"
+
 def waits(progress, path):
     Path(path).write_text(str(os.getpid()))
     time.sleep(600)
@@ -55,7 +66,8 @@ def has_a_helper(progress):
     helper = multiprocessing.Process(target=time.sleep, args=(0,))
     helper.start()
     helper.join()
-    return f"its helper ended with {helper.exitcode}"
+    blocked = [*signal.pthread_sigmask(signal.SIG_BLOCK, [])]
+    return f"its helper ended with {helper.exitcode}, and it inherits {blocked}"
 
 def names_its_gpu(progress):
     return f"on GPU {os.environ.get('CUDA_VISIBLE_DEVICES')}"
@@ -140,7 +152,7 @@ def test_closing_ends_a_job_that_ignores_it_and_its_children(
 
 def test_a_job_may_start_processes_of_its_own(bars: Bars) -> None:
     assert run_jobs([_job("has_a_helper")], Processes(1), bars) == {}
-    assert "its helper ended with 0" in printed(bars)
+    assert "its helper ended with 0, and it inherits []" in printed(bars)  # no signal is blocked
 
 
 @pytest.mark.parametrize("workers", [Processes, Here])
@@ -152,6 +164,16 @@ def test_an_interrupt_or_a_cancellation_that_a_job_raises_is_its_failure(
 ) -> None:
     (reason,) = run_jobs([_job(function)], workers(), bars).values()
     assert reason.startswith(f"{error}: of its own")
+
+
+@pytest.mark.parametrize("seconds", [0.0, 1000.0])
+def test_reports_add_up_to_the_progress_of_a_job(seconds: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("clbench.jobs.processes.SEND_SECONDS", seconds)
+    workers, found = Here(), list[Event]()
+    workers.start(_job("thirds"))
+    while not (found and found[-1].ends_job):
+        found += workers.events()
+    assert sum(event.value for event in found if event.kind == "progress") == 0.75
 
 
 def test_what_is_announced_after_a_job_of_this_process_is_no_place_of_the_job() -> None:
@@ -230,10 +252,10 @@ def test_leases_are_given_back_if_closing_is_interrupted(tmp_path: Path, bars: B
     assert stopped.value.code is None
 
 
-SUSPENDED = """
+COMMAND = """
 import signal
 from multiprocessing.context import BaseContext
-from jobs_with_children import waits
+from jobs_with_children import FUNCTION
 from clbench.jobs.job import Job
 from clbench.jobs.processes import Processes
 
@@ -241,7 +263,7 @@ if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where a shell began the tests with &
     BaseContext.set_forkserver_preload = lambda *_: None  # this job needs no PyTorch
     workers = Processes(1)
-    workers.start(Job("waits", waits, {"path": "worker"}, 1))
+    workers.start(Job("job", FUNCTION, {"path": "worker"}, 1))
     try:
         while True:
             list(workers.events())
@@ -250,15 +272,28 @@ if __name__ == "__main__":
 """
 
 
+def _command(function: str, folder: Path) -> subprocess.Popen[bytes]:
+    """Start a command with one worker, which writes its process id to the file `worker`."""
+    (folder / "command.py").write_text(COMMAND.replace("FUNCTION", function), encoding="utf-8")
+    (folder / "jobs_with_children.py").write_text(JOBS, encoding="utf-8")
+    arguments = [sys.executable, "command.py"]
+    return subprocess.Popen(arguments, cwd=folder, start_new_session=True, stderr=subprocess.DEVNULL)
+
+
 @pytest.mark.long
-def test_ctrl_z_stops_the_workers_with_the_command_and_they_go_on_with_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "command.py").write_text(SUSPENDED, encoding="utf-8")
-    (tmp_path / "jobs_with_children.py").write_text(JOBS, encoding="utf-8")
-    quiet = subprocess.DEVNULL
-    command = subprocess.Popen([sys.executable, "command.py"], start_new_session=True, stderr=quiet)
+def test_a_worker_ends_soon_after_its_command_was_killed(tmp_path: Path) -> None:
+    command = _command("goes_on", tmp_path)
+    try:
+        worker = _read_number(tmp_path / "worker")
+    finally:
+        command.kill()
+        command.wait()
+    assert _is_gone(worker)
+
+
+@pytest.mark.long
+def test_ctrl_z_stops_the_workers_with_the_command_and_they_go_on_with_it(tmp_path: Path) -> None:
+    command = _command("waits", tmp_path)
     try:
         processes = [command.pid, _read_number(tmp_path / "worker")]
         command.send_signal(signal.SIGTSTP)

@@ -2,12 +2,14 @@
 
 import io
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
+from clbench.base.lease import Lease
 from clbench.jobs.bars import Bars
-from clbench.jobs.job import Ending, Event, Job
+from clbench.jobs.job import Ending, Event, Job, Product
 from clbench.jobs.scheduler import run_jobs
 
 
@@ -78,6 +80,16 @@ def test_a_job_without_events_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
 
     first, *_ = _lines([Job("patient", str, {}, 10.0)], Silent(), monkeypatch)
     assert first == "  0%: patient"
+
+
+def test_other_commands_are_told_which_share_of_a_job_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shares: list[float] = []
+    monkeypatch.setattr(Lease, "report", lambda lease, share: shares.append(share))
+    made = Product(tmp_path / "made", exists=lambda: False)
+    _lines([Job("run", str, {}, 10.0, product=made)], Scripted(), monkeypatch)
+    assert shares == [0.5]
 
 
 def test_a_job_that_another_process_takes_over_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:

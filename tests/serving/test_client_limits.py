@@ -52,7 +52,8 @@ def test_a_request_that_no_server_would_read_is_refused_before_it_is_sent(
 def test_a_reply_may_be_as_large_as_a_request(served: ServedPolicy) -> None:
     state = np.zeros((40, 60_000), bool)  # 2 MB; websockets alone would refuse more than 1 MB
     found = served({**OBSERVATIONS, "state": state})
-    assert (found.shape, found.dtype) == ((40, 1, 60_000), bool)
+    assert found.shape == (40, 1, 60_000)
+    assert found.dtype == np.bool_
 
 
 def test_the_time_limit_of_a_request_ends_with_it(served: ServedPolicy) -> None:
