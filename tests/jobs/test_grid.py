@@ -309,6 +309,7 @@ def test_making_policies_of_a_submitted_method_again_has_the_limits_of_its_check
         ({"seeds": 1.5}, "seeds must be a whole number from 1, not 1.5"),
         ({"seeds": 0}, "seeds must be a whole number from 1, not 0"),
         ({"seeds": 10_001}, "seeds must be at most 10,000, not 10001"),
+        ({"seeds": 10_000, "method": "stf"}, "Did you mean 'sft'"),  # so many may be asked for
         ({"seeds": np.int64(10_001)}, "seeds must be at most 10,000, not 10001"),
         (
             {"first_seed": 2**64},

@@ -2,6 +2,8 @@
 
 import importlib
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +14,7 @@ import pytest
 
 from clbench.jobs.bars import Bars
 from clbench.jobs.job import Job
-from clbench.jobs.process_limits import exceeded
+from clbench.jobs.process_limits import end, exceeded, usage
 from clbench.jobs.processes import Processes
 from clbench.jobs.scheduler import run_jobs
 from clbench.spec.limits import Limits
@@ -93,9 +95,34 @@ def test_a_job_that_writes_too_much_is_stopped(tmp_path: Path, done: Done) -> No
 def test_the_children_of_a_stopped_job_are_stopped_too(tmp_path: Path, done: Done) -> None:
     path = tmp_path / "child"
     done(("parent", Limits(written=20_000_000)), path=os.fspath(path))
-    child = int(path.read_text())
+    _wait_for_end(int(path.read_text()))
+
+
+LARGE = """
+import subprocess, sys, time
+memory = b"x" * 100_000_000
+code = "import time; memory = b'x' * 100_000_000; print(flush=True); time.sleep(600)"
+child = subprocess.Popen([sys.executable, "-c", code], start_new_session=True, stdout=subprocess.PIPE)
+child.stdout.readline()
+print(child.pid, flush=True)
+time.sleep(600)
+"""
+
+
+def test_a_process_counts_and_ends_together_with_a_child_that_left_its_group() -> None:
+    command = [sys.executable, "-c", LARGE]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True) as process:
+        assert process.stdout is not None
+        child = int(process.stdout.readline())
+        memory, _ = usage(process.pid)
+        end(process.pid)
+    assert memory > 200_000_000
+    _wait_for_end(child)
+
+
+def _wait_for_end(process: int) -> None:
     deadline = time.monotonic() + 50
-    while _is_alive(child):
+    while _is_alive(process):
         assert time.monotonic() < deadline
         time.sleep(0.1)
 
