@@ -20,6 +20,7 @@ from torch import nn
 
 import clbench
 from clbench.base.errors import ClbenchError
+from clbench.base.leftovers import unfinished
 from clbench.base.progress import ProgressCallback
 from clbench.jobs.grid import missing, run_missing
 from clbench.jobs.job import Job
@@ -171,6 +172,31 @@ def test_runs_that_failed_are_not_counted_and_neither_are_the_jobs_that_they_sha
     lost, last = console.file.getvalue().splitlines()
     assert "it ended without a record of this run at" in lost
     assert re.match(r"0 of 2 runs in \d+\.\d minutes; records in ", last)
+
+
+def test_after_a_check_that_fails_no_run_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(jobs: Sequence[Job], *_: Any) -> dict[Job, str]:
+        return dict.fromkeys(jobs, "left out")
+
+    monkeypatch.setattr("clbench.jobs.grid.run_with_bars", fail)
+    check, console = Job("check", str, {}, 1.0), Console(file=io.StringIO(), width=200)
+    failed = run_missing([RunSpec(TOY, "sft", 1).resolve()], tmp_path, Here, console, check=check)
+    assert check in failed
+    assert isinstance(console.file, io.StringIO)
+    assert console.file.getvalue() == ""
+
+
+def test_what_killed_commands_left_beside_records_and_policies_is_removed(
+    tmp_path: Path, empty_caches: Path
+) -> None:
+    left = []
+    for folder in (tmp_path / "records", tmp_path / "kept"):
+        folder.mkdir()
+        path = unfinished(folder / "made")
+        left.append(path.with_name(path.name.replace(f"{os.getpid():08x}", f"{2**22 - 1:08x}", 1)))
+        left[-1].touch()
+    run_missing([], tmp_path / "records", Here, Console(file=io.StringIO()), checkpoints=tmp_path / "kept")
+    assert not any(path.exists() for path in left)
 
 
 @pytest.mark.long

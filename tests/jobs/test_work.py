@@ -17,11 +17,13 @@ from clbench.jobs.work import (
     evaluate_policy,
     pretrain,
 )
+from clbench.learning.pretraining import is_pretrained
 from clbench.records.paths import failed_name
 from clbench.records.reader import read_record
 from clbench.records.record import Record
 from clbench.records.writer import write_record, write_result
 from clbench.runs.spec import RunSpec
+from clbench.runs.stages import has_stages
 
 WORDY = """
 from dataclasses import dataclass
@@ -42,7 +44,10 @@ def test_a_policy_that_can_do_little_is_called_weak_before_and_after_a_run(
 ) -> None:
     nothing: Any = lambda _: None  # noqa: E731
     assert evaluate_policy(SPEC, nothing) == "success 1.00 on the retained skills"
-    assert "pretrained" not in do_run(SPEC, tmp_path / "strong", nothing)
+    folders = {"checkpoints": tmp_path / "kept", "tensorboard": tmp_path / "logs"}
+    assert "pretrained" not in do_run(SPEC, tmp_path / "strong", nothing, **folders)
+    assert has_stages(SPEC.resolve(), folders["checkpoints"])
+    assert [*folders["tensorboard"].rglob("events.*")]
     monkeypatch.setattr(Record, "retained_at_start", lambda _: 0.33)
     said = evaluate_policy(SPEC, nothing)
     assert said.startswith("success 0.33 on the retained skills. That is low: ")
@@ -51,6 +56,7 @@ def test_a_policy_that_can_do_little_is_called_weak_before_and_after_a_run(
     for rate, weak in ((0.79, True), (0.8, False)):
         monkeypatch.setattr(Record, "retained_at_start", lambda _, rate=rate: rate)
         assert ("That is low" in evaluate_policy(SPEC, nothing)) == weak
+        assert ("of only" in do_run(SPEC, tmp_path / str(rate), nothing)) == weak
 
 
 @pytest.mark.long
@@ -66,7 +72,8 @@ def test_what_is_in_the_cache_is_not_said_to_be_made(empty_caches: Path) -> None
     for end in ("for the test", "for the test, from the cache"):
         assert collect_scenes(TINY.id, nothing).endswith(end)
     for end in ("parameters", "parameters, from the cache"):
-        assert pretrain(TINY.id, "flow", 0, nothing).endswith(end)
+        assert pretrain(TINY.id, "discrete_diffusion", 0, nothing).endswith(end)
+    assert is_pretrained(TINY.with_policy("discrete_diffusion"), 0)
 
 
 def test_a_long_message_is_cut_where_it_is_said_and_whole_in_the_record(

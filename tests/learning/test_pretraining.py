@@ -85,6 +85,47 @@ def test_a_policy_that_learned_other_questions_of_the_same_module_is_another_one
     assert pretrained_folder(other, 0) != pretrained_folder(toy, 0)
 
 
+class Fixed(TransformerPolicy):
+    """Has pretrained weights of its own, the same for all seeds."""
+
+    pretrained = True
+
+    def __init__(self, config: PolicyConfig, seed: int = 0) -> None:
+        super().__init__(config, 0)
+
+
+def test_seeds_of_the_same_weights_share_a_folder() -> None:
+    toy = load_scenario("clbench.testing:clbench/Toy-v0")
+    brought = dataclasses.replace(toy, policy=f"{__name__}:Fixed")
+    assert pretrained_folder(brought, 0) == pretrained_folder(brought, 1)
+    assert pretrained_folder(toy, 0) != pretrained_folder(toy, 1)
+
+
+def test_builds_of_one_version_of_a_package_share_a_policy(monkeypatch: pytest.MonkeyPatch) -> None:
+    folders = []
+    for version in ("2.8.0", "2.8.0+cpu", "2.8.1"):
+        monkeypatch.setattr("clbench.learning.pretraining.versions", lambda _, it=version: {"torch": it})
+        folders.append(pretrained_folder(FETCH, 1))
+    assert folders[0] == folders[1] != folders[2]
+
+
+@pytest.mark.long
+def test_the_vision_learns_from_the_pictures_of_the_questions_and_of_the_demonstrations(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    toy, sizes = load_scenario("clbench.testing.seen_toy:clbench/SeenToy-v0"), list[int]()
+
+    def count(vision: object, sets: Any, *_: object) -> None:
+        sizes.extend(len(one.image) for one in sets)
+
+    monkeypatch.setattr("clbench.learning.pretraining.pretrain_vision", count)
+    brief = dataclasses.replace(toy, budget=dataclasses.replace(toy.budget, pretraining_steps=1))
+    pretrain(brief, 0)
+    demonstrations = [load_demonstrations(task, brief, policy_config(brief)) for task in brief.retained]
+    questions, _ = load_questions(brief)
+    assert sizes == [len(questions.image), sum(len(one.image) for one in demonstrations)]
+
+
 def test_other_seeds_are_pretrained_in_the_cache() -> None:
     assert pretrained_folder(FETCH, 1).parent == cache_folder() / "pretrained"
 
@@ -170,6 +211,8 @@ def test_pretraining_repeats_itself_in_a_loop_written_out() -> None:
         loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
         optimiser.step()
-    made = pretrain(brief, 5).state_dict()
+    watched: list[int] = []
+    made = pretrain(brief, 5, watch=lambda policy, step: watched.append(step)).state_dict()
+    assert watched == [*range(steps + 1)]
     for name, value in policy.state_dict().items():
         torch.testing.assert_close(made[name], value, rtol=0, atol=1e-7)

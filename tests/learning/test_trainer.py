@@ -4,6 +4,8 @@ import copy
 import dataclasses
 import importlib.metadata
 import math
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,8 +16,10 @@ from tiny import TINY
 from clbench.base.seeding import torch_generator
 from clbench.data.demonstrations import Demonstrations
 from clbench.learning.adaptation import Step
-from clbench.learning.method import Method, Progress
+from clbench.learning.method import Method, MethodState, Progress, Stage
+from clbench.learning.prior import UndeclaredAccessError
 from clbench.learning.trainer import Trainer, training_inputs
+from clbench.policy.policy import Policy
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -104,6 +108,68 @@ def test_the_step_factor_changes_the_scheduled_rate_and_not_the_one_that_a_metho
     trainer.learn(1, lambda step: rates.append(step.learning_rate))
     assert rates == [2e-4] * STEPS
     assert max(method.scheduled) == pytest.approx(0.5 * TINY.budget.learning_rate)
+
+
+@dataclasses.dataclass
+class Watching(Method):
+    """Trains the head alone, keeps its target, draws whenever it can, and takes two steps of its own."""
+
+    whole_stages = True
+    target: Any = None
+    left: bool = False
+
+    def start_task(self, policy: Policy, stage: Stage) -> Any:
+        self.target = stage.target
+        return policy.head.parameters()
+
+    def gradients(self, policy: Policy, loss: torch.Tensor) -> None:
+        self.left |= any(parameter.grad is not None for parameter in policy.parameters())
+        super().gradients(policy, loss)
+
+    def end_task(self, policy: Policy, stage: Stage) -> None:
+        torch.rand(())
+        optimiser = torch.optim.SGD(policy.head.parameters(), 1e-6)
+        for _ in range(2):
+            optimiser.step()
+
+    def state(self) -> MethodState:
+        return {"learned": True}
+
+    def load_state(self, policy: Policy, state: MethodState) -> None:
+        torch.rand(())
+
+
+def _same_draws(action: Callable[[], object]) -> bool:
+    """Return whether an action leaves the random draws of the program as they were."""
+    before = torch.get_rng_state()
+    action()
+    return torch.get_rng_state().equal(before)
+
+
+def test_looks_at_a_policy_count_no_steps_and_neither_they_nor_loading_it_move_a_draw(tmp_path: Path) -> None:
+    trainer = _trainer("sft")
+    trainer.method, trainer.new_method = Watching(), Watching
+    kept = list[bool]()
+    trainer.learn(1, lambda step: kept.append(_same_draws(trainer.finished)))
+    assert all(kept)
+    assert trainer.extra_steps == 2  # of the end of the stage alone
+    trainer.save(tmp_path, trainer.state(1))
+    assert _same_draws(lambda: trainer.load(tmp_path, 1))
+
+
+def test_gradients_begin_empty_in_each_step_even_of_what_is_not_trained() -> None:
+    trainer = _trainer("sft")
+    trainer.method = method = Watching()
+    trainer.learn(1, _go_on)
+    assert not method.left
+
+
+def test_the_target_of_a_stage_closes_after_it() -> None:
+    trainer = _trainer("sft")
+    trainer.method = method = Watching()
+    trainer.learn(1, _go_on)
+    with pytest.raises(UndeclaredAccessError, match="after the hooks that received it"):
+        method.target.sample(1)
 
 
 def test_the_key_of_a_run_names_the_version_of_the_package_that_only_methods_use() -> None:

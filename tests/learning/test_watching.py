@@ -14,6 +14,7 @@ from tiny import TINY
 import clbench
 from clbench.base.cache import cache_folder
 from clbench.base.progress import no_progress
+from clbench.learning.method_state import StateError
 from clbench.learning.optimise import MethodError
 from clbench.learning.pretraining import pretrain
 from clbench.learning.trainer import Trainer
@@ -66,6 +67,24 @@ class Careful(clbench.Method):
 
     def load_state(self, policy: clbench.Policy, state: dict[str, Any]) -> None:
         self.largest = state["largest"]
+
+
+@dataclass
+class Scaled(Careful):
+    """Multiplies what it sees."""
+
+    scale: float = 1.0
+
+    def state(self) -> dict[str, Any]:
+        return {"largest": self.scale * self.largest}
+
+
+@dataclass
+class Listing(Careful):
+    """Returns a list in its state."""
+
+    def state(self) -> dict[str, Any]:
+        return {"largest": [self.largest]}
 
 
 @dataclass
@@ -123,6 +142,12 @@ def test_a_draw_after_the_pretraining_repeats_itself_and_moves_no_other() -> Non
     assert len(drawn) == 1
 
 
+def test_the_pretraining_that_is_watched_is_that_of_the_policy_and_not_of_the_run() -> None:
+    opened = Trainer.open(TINY, Careful, 0, "cpu")
+    trainer = Trainer(TINY, opened.data, opened.pretrained, Careful, seed=3, pretraining_seed=0)
+    assert trainer.prepare() == TINY.budget.pretraining_steps
+
+
 @pytest.mark.usefixtures("empty_caches")
 def test_a_pretraining_from_the_cache_counts_as_many_steps_as_a_watched_one() -> None:
     pretrained = pretrain(TINY, 0, no_progress)
@@ -130,6 +155,27 @@ def test_a_pretraining_from_the_cache_counts_as_many_steps_as_a_watched_one() ->
         steps: list[float] = []
         watch(Careful(), pretrained, TINY, 0, nullcontext, steps.append)
         assert sum(steps) == TINY.budget.pretraining_steps
+    with torch.no_grad():
+        next(pretrained.parameters()).add_(1.0)
+    with pytest.raises(MethodError, match=r"watch_pretraining\(\) must change nothing, but .* differs"):
+        watch(Careful(), pretrained, TINY, 0, nullcontext, no_progress)  # not from the cache of other weights
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_each_setting_of_a_method_has_a_state_of_its_own() -> None:
+    pretrained = pretrain(TINY, 0, no_progress)
+    one, two = (
+        watch(Scaled(scale=scale), pretrained, TINY, 0, nullcontext, no_progress)["largest"]
+        for scale in (1.0, 2.0)
+    )
+    assert two == 2 * one  # type: ignore[operator]
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_a_state_that_no_file_can_hold_is_refused_after_the_pretraining() -> None:
+    pretrained = pretrain(TINY, 0, no_progress)
+    with pytest.raises(StateError, match=r"state\(\) must return a flat dictionary"):
+        watch(Listing(), pretrained, TINY, 0, nullcontext, no_progress)
 
 
 def test_only_a_method_that_overrides_the_hook_watches() -> None:
