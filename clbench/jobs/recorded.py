@@ -157,8 +157,7 @@ def _check_definition(record: Record, published: Scenario, path: Path) -> None:
     """Refuse a record that was made with another definition of its scenario."""
     from clbench.evaluation.definition import definition
 
-    recorded = record.fingerprint.get("definition")
-    other = [] if recorded is None else other_parts(recorded, definition(published))
+    other = other_parts(record.fingerprint.get("definition"), definition(published))
     if other:
         machine = machine_of(record.fingerprint)
         advice = "Give the changed scenario a new version, or choose"

@@ -115,8 +115,11 @@ def test_the_vision_learns_from_the_pictures_of_the_questions_and_of_the_demonst
 ) -> None:
     toy, sizes = load_scenario("clbench.testing.seen_toy:clbench/SeenToy-v0"), list[int]()
 
-    def count(vision: object, sets: Any, *_: object) -> None:
+    def count(
+        vision: object, sets: Any, kinds: object, steps: int, generator: torch.Generator, *_: Any
+    ) -> None:
         sizes.extend(len(one.image) for one in sets)
+        assert generator.initial_seed() == torch_generator("vision", 0).initial_seed()
 
     monkeypatch.setattr("clbench.learning.pretraining.pretrain_vision", count)
     brief = dataclasses.replace(toy, budget=dataclasses.replace(toy.budget, pretraining_steps=1))
