@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers import complete_record
+from helpers import complete_record, write_unchecked
 from rich.console import Console
 
 from clbench.base import source
@@ -35,7 +35,6 @@ from clbench.records.record import (
     RunInfo,
     ScenarioInfo,
 )
-from clbench.records.writer import record_text
 from clbench.runs import fingerprint
 from clbench.runs.length import run_length
 from clbench.runs.run import execute
@@ -215,8 +214,7 @@ def add(make_record: Callable[..., Record], matrix: Any, tmp_path: Path) -> Call
             edit(record)
         records = tmp_path / "leaderboard" / "records"
         path = records / place if place else record_path(records, record.run.scenario, method, seed)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(record_text(record), encoding="utf-8")  # unlike write_record, it accepts anything
+        write_unchecked(record, path)
         return path
 
     return add

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import lose_home
+from helpers import lose_home, write_unchecked
 from safetensors.numpy import save_file
 
 from clbench.base.cache import cache_folder, cached, hash_of, minari_folder
@@ -16,7 +16,6 @@ from clbench.base.lease import Lease
 from clbench.cli.cache import entries, find_stale
 from clbench.cli.main import app
 from clbench.records.record import Record
-from clbench.records.writer import record_text
 
 DAY = 24 * 60 * 60
 
@@ -240,7 +239,7 @@ def test_records_on_their_way_are_deleted_and_other_json_is_left(
 ) -> None:
     ours, mixed, foreign = (_write(cache_folder() / "ray" / hash_of(name) / "a.json") for name in "abc")
     for path in (ours, mixed):
-        path.write_text(record_text(make_record([[1.0, 0.0, 0.0], [1.0, 1.0, 0.0]])), encoding="utf-8")
+        write_unchecked(make_record([[1.0, 0.0, 0.0], [1.0, 1.0, 0.0]]), path)
     settings = _write(mixed.with_name("settings.json"))
     for path in (ours, mixed, foreign):
         _age(path.parent, 40)

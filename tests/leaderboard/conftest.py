@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import write_unchecked
 
 from clbench.base.entry_points import resolve
 from clbench.records.paths import label_of, record_path
 from clbench.records.record import Record
-from clbench.records.writer import record_text
 from clbench.scoring.intervals import estimate, estimate_quantity, paired_difference
 from clbench.spec.scenario import balanced_order
 
@@ -104,8 +104,7 @@ def even_board(make_record: Callable[..., Record], tmp_path: Path) -> Callable[.
         swapped = dict(zip(names, record.scenario.target, strict=True))
         record.episodes["task"] = [swapped.get(task, task) for task in record.episodes["task"]]
         path = record_path(tmp_path / folder, EVEN, label_of(method, changes), seed)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(record_text(record), encoding="utf-8")
+        write_unchecked(record, path)
         return tmp_path / "records"
 
     return add

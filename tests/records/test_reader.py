@@ -134,6 +134,7 @@ def test_relearning_is_read_as_it_was_written(make_record: Callable[..., Record]
         ({"order": 1.0}, "run: order must be a whole number, not 1.0"),
         ({"order": -1}, "run: order must be from 0 to 99"),
         ({"order": 2**63}, "run: order must be from 0 to 99"),
+        ({"split": "all"}, "run: split must be test or validation, not 'all'"),
         ({"perturb": 1}, "run: perturb must be true or false, not 1"),
         ({"seed": False}, "run: seed must be a whole number, not false"),
         ({"method": ["sft"]}, "run: method must be a string"),
@@ -207,7 +208,13 @@ def test_columns_that_do_not_fit_together_are_refused_by_name(
 @pytest.mark.parametrize(
     ("field", "words"),
     [
+        ({"retained": None}, "scenario: retained must be a list, not null"),
+        ({"retained": "skill"}, 'scenario: retained must be a list, not "skill"'),
         ({"retained": [1]}, "an entry of scenario: retained must be a string, not 1"),
+        ({"evaluation_steps": None}, "scenario: evaluation_steps must be a list, not null"),
+        ({"evaluation_steps": 400}, "scenario: evaluation_steps must be a list, not 400"),
+        ({"evaluation_steps": [100.0]}, "scenario: evaluation_steps must be a whole number, not 100.0"),
+        ({"evaluation_steps": ["400"]}, 'scenario: evaluation_steps must be a whole number, not "400"'),
         ({"evaluation_steps": [True]}, "an entry of scenario: evaluation_steps must be a whole number"),
         ({"budget": []}, "scenario: budget must be an object with named entries"),
     ],

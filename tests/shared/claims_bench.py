@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from helpers import write_unchecked
 
 from clbench.base.entry_points import resolve
 from clbench.records.paths import label_of, record_path
 from clbench.records.reader import read_record
 from clbench.records.record import Record
-from clbench.records.writer import record_text, write_record
+from clbench.records.writer import write_record
 from clbench.spec.protocol import check_steps
 from clbench.testing import TOY
 
@@ -106,8 +107,7 @@ class Bench:
             if edit:
                 edit(record)
             path = record_path(self.folder / self.kind(label), SCENARIO, label_of(method, changed), seed)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(record_text(record), encoding="utf-8")  # write_record would read it again
+            write_unchecked(record, path)
 
     def kind(self, label: str) -> str:
         return "ladder" if "@" in label else "controls" if "+" in label else "records"

@@ -30,7 +30,7 @@ from clbench.policy.policy import Policy
 from clbench.records.content import content_hash
 from clbench.records.paths import record_path
 from clbench.records.record import AnswerRow, EpisodeRow, PolicyRow, Record
-from clbench.records.writer import write_record
+from clbench.records.writer import record_text, write_record
 from clbench.runs.spec import ResolvedRun
 from clbench.runs.stages import kept_stages, load_stages, make_stages
 from clbench.scoring.reading import read_protocol
@@ -98,6 +98,12 @@ def resealed(content: bytes) -> bytes:
         return json.dumps(sealed(values)).encode() if isinstance(values, dict) else content
     except (ValueError, TypeError, RecursionError):
         return content
+
+
+def write_unchecked(record: Record, path: Path) -> None:
+    """Write a record of any content; `write_record` would read it again, and refuse a faulty one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(record_text(record), encoding="utf-8")
 
 
 def complete_record(record: Record) -> None:

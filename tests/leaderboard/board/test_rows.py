@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import complete_record, set_in
+from helpers import complete_record, set_in, write_unchecked
 
 from clbench.base.entry_points import resolve
 from clbench.records.record import Record
-from clbench.records.writer import record_text
 
 agreement = resolve("clbench.leaderboard.board.rows:agreement")
 compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
@@ -223,8 +222,7 @@ def add_elsewhere(make_record: Callable[..., Record], tmp_path: Path) -> Callabl
         complete_record(record)
         record.checks |= checks or {}
         path = tmp_path / "records" / "Even-v1" / "me--elsewhere" / f"seed-{seed}.json"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(record_text(record), encoding="utf-8")
+        write_unchecked(record, path)
         return tmp_path / "records"
 
     return add
