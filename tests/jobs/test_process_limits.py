@@ -4,13 +4,12 @@ import importlib
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
+from helpers import is_gone
 
 from clbench.jobs.bars import Bars
 from clbench.jobs.job import Job
@@ -95,7 +94,7 @@ def test_a_job_that_writes_too_much_is_stopped(tmp_path: Path, done: Done) -> No
 def test_the_children_of_a_stopped_job_are_stopped_too(tmp_path: Path, done: Done) -> None:
     path = tmp_path / "child"
     done(("parent", Limits(written=20_000_000)), path=os.fspath(path))
-    _wait_for_end(int(path.read_text()))
+    assert is_gone(int(path.read_text()))
 
 
 LARGE = """
@@ -117,22 +116,7 @@ def test_a_process_counts_and_ends_together_with_a_child_that_left_its_group() -
         memory, _ = usage(process.pid)
         end(process.pid)
     assert memory > 200_000_000
-    _wait_for_end(child)
-
-
-def _wait_for_end(process: int) -> None:
-    deadline = time.monotonic() + 50
-    while _is_alive(process):
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
-
-
-def _is_alive(process: int) -> bool:
-    try:
-        status: str = psutil.Process(process).status()
-    except psutil.NoSuchProcess:
-        return False
-    return bool(status != psutil.STATUS_ZOMBIE)
+    assert is_gone(child)
 
 
 def test_a_process_that_has_ended_exceeds_no_limit() -> None:

@@ -14,7 +14,7 @@ from typing import Any
 
 import psutil
 import pytest
-from helpers import printed
+from helpers import is_gone, printed
 
 from clbench.base.cache import cache_folder, minari_folder
 from clbench.base.progress import announce
@@ -104,22 +104,10 @@ def _job(function: str, **arguments: Any) -> Job:
     return Job(function, getattr(importlib.import_module("jobs_with_children"), function), arguments, 1)
 
 
-def _is_gone(process: int) -> bool:
-    """Return whether a process ends within a minute; a zombie has ended."""
-    for _ in range(600):
-        try:
-            if psutil.Process(process).status() == psutil.STATUS_ZOMBIE:
-                return True
-        except psutil.NoSuchProcess:
-            return True
-        time.sleep(0.1)
-    return False
-
-
 def test_the_children_of_a_job_end_with_it(tmp_path: Path, bars: Bars) -> None:
     path = tmp_path / "child"
     assert run_jobs([_job("leaves_a_child", path=str(path))], Processes(1), bars) == {}
-    assert _is_gone(int(path.read_text()))
+    assert is_gone(int(path.read_text()))
 
 
 def test_a_job_whose_forked_child_lives_on_is_lost_at_once(tmp_path: Path, bars: Bars) -> None:
@@ -127,7 +115,7 @@ def test_a_job_whose_forked_child_lives_on_is_lost_at_once(tmp_path: Path, bars:
     (reason,) = run_jobs([_job("dies_beside_a_fork", path=str(path))], Processes(1), bars).values()
     assert reason == "its process ended without a result (exit code -9, SIGKILL)"
     assert time.monotonic() - begin < 300
-    assert _is_gone(int(path.read_text()))
+    assert is_gone(int(path.read_text()))
 
 
 @pytest.mark.parametrize(("number", "name"), [(9, "SIGKILL"), (40, "signal 40")])
@@ -146,7 +134,7 @@ def test_closing_ends_a_job_that_ignores_it_and_its_children(
     while not (path.exists() and path.read_text()):
         time.sleep(0.05)
     workers.close()
-    assert all(_is_gone(int(pid)) for pid in path.read_text().split())
+    assert all(is_gone(int(pid)) for pid in path.read_text().split())
     assert (workers.free(), signal.getsignal(signal.SIGTSTP)) == (1, suspends)
 
 
@@ -288,7 +276,7 @@ def test_a_worker_ends_soon_after_its_command_was_killed(tmp_path: Path) -> None
     finally:
         command.kill()
         command.wait()
-    assert _is_gone(worker)
+    assert is_gone(worker)
 
 
 @pytest.mark.long
@@ -305,7 +293,7 @@ def test_ctrl_z_stops_the_workers_with_the_command_and_they_go_on_with_it(tmp_pa
     finally:
         command.kill()
         command.wait()
-    assert _is_gone(processes[1])
+    assert is_gone(processes[1])
 
 
 def test_the_time_for_which_a_command_is_stopped_does_not_count_for_a_limit(

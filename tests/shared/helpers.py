@@ -10,11 +10,13 @@ import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 from numpy.typing import NDArray
 from torch import Tensor
@@ -52,6 +54,18 @@ def output_of(code: str) -> str:
     """Return what a Python program prints in a process of its own, which must succeed."""
     command = [sys.executable, "-c", code]  # what it says of an error goes to the report of the test
     return subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
+
+
+def is_gone(process: int) -> bool:
+    """Return whether a process ends within a minute; a zombie has ended."""
+    for _ in range(600):
+        try:
+            if psutil.Process(process).status() == psutil.STATUS_ZOMBIE:
+                return True
+        except psutil.NoSuchProcess:
+            return True
+        time.sleep(0.1)
+    return False
 
 
 def scenario_or_skip(scenario_id: str) -> Scenario:
@@ -216,7 +230,7 @@ def stage_policies(
 
 
 def lose_home(patch: pytest.MonkeyPatch) -> None:
-    """Let this process be that of a user without an account, who has named no folder for data either."""
+    """Act as a user without an account who has named no folder for data."""
 
     def has_no_account(_: int) -> None:
         raise KeyError
