@@ -177,8 +177,8 @@ def submit(
         order: Order of the targets, for scenarios with one published order: 0 is that order, other numbers
             are permutations. Only order 0 makes rows. Scenarios with a separate order for each seed, such
             as Fetch-v1, accept only 0.
-        workers: Number of runs at once, each a process with one thread (default: all cores; with --device
-            cuda, all GPUs).
+        workers: Number of runs at once, and of the cores that they share (default: all cores; with --device
+            cuda, one run per GPU, and all cores).
         records: Folder of the records.
         device: Device that runs the policies, for example cpu or cuda, which gives each run one of the GPUs.
         checkpoints: Keep the policies of all stages below this folder, so that `clbench verify` need not make
@@ -251,8 +251,8 @@ def verify(
         any_processor: Also train again on a processor that may compute differently from the record's. Equal
             results prove the record; different results prove nothing.
         by: Your name, for the file (default: none).
-        workers: Number of verifications at once, each a process with one thread (default: all cores; for
-            records of cuda, all GPUs).
+        workers: Number of verifications at once, and of the cores that they share (default: all cores; for
+            records of cuda, one per GPU, and all cores).
         records: Folder of the records.
         as_json: Print a JSON list that states for each record whether it passed, its tier, checks and
             failure.

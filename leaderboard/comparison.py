@@ -49,8 +49,8 @@ def compare(
         first_seed: The first seed. All seeds must be below 100: no board shows the seeds for tuning.
         policy: Name of the policy, such as "discrete_diffusion", "flow-base" or "module:Class".
         records: Folder of the records. Records of other methods are not read.
-        workers: Number of runs at once, each a process with one thread; all cores if None, or all
-            GPUs with the device "cuda".
+        workers: Number of runs at once, and of the cores that they share; if None all cores, and with the
+            device "cuda" one run per GPU.
         device: Device that runs the policies, for example "cpu" or "cuda".
 
     Returns:

@@ -307,7 +307,7 @@ def _machine() -> dict[str, str]:
         rendering[f"rendering: {back_end}"] = "works" if fault is None else f"does not work; {help_}"
     machine = {
         "python": sys.version.split()[0],
-        "cores": f"{cores()} ({torch.get_num_threads()} threads in PyTorch; a run uses one)",
+        "cores": f"{cores()} ({torch.get_num_threads()} threads in PyTorch; a run computes with one)",
         "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else "none (and none is needed)",
         "arithmetic": f"{arithmetic_hash()} (the same on machines that train to the same bits)",
         **rendering,

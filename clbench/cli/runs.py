@@ -84,8 +84,8 @@ def run(
         perturb: Also evaluate the skills and each new target in perturbed worlds: other start poses, heavier
             or lighter objects and, in pictures, another camera and light. Such a record replaces a record
             without perturbed episodes, as it holds the same episodes and more.
-        workers: Number of runs at once, each a process with one thread (default: all cores; with --device
-            cuda, all GPUs).
+        workers: Number of runs at once, and of the cores that they share (default: all cores; with --device
+            cuda, one run per GPU, and all cores).
         shard: Do only part i of n of the runs, for example 2/8: for array jobs with one folder of records.
         ray: Do the runs on a Ray cluster: its address, auto for a cluster on this machine, or local to start
             one.

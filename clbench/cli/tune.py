@@ -84,8 +84,8 @@ def tune(
         values: Hyper-parameters and the values to try, as --values.tau_start 0.3,1,3
         targets: Number of targets to learn, from the first, with --values (default: all). The
             records of such runs go to a separate folder, for example targets-1 below --records.
-        workers: Number of runs at once, each a process with one thread (default: all cores; with --device
-            cuda, all GPUs).
+        workers: Number of runs at once, and of the cores that they share (default: all cores; with --device
+            cuda, one run per GPU, and all cores).
         device: Device that runs the policies, for example cpu or cuda, which gives each run one of the GPUs.
         policy: flow or discrete_diffusion; a larger size, for example flow-base (5 million parameters) or
             flow-large (40 million); or a class of your own, as module:Class.

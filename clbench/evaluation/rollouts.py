@@ -26,6 +26,7 @@ from clbench.spec.protocol import SPLITS, Split
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 from clbench.worlds.lanes import Lanes
+from clbench.worlds.threads import shared_cores
 
 LOG = logging.getLogger(__name__)
 
@@ -36,21 +37,22 @@ class Evaluator:
     Args:
         scenario: Scenario of the tasks.
         seed: Seed of the run: it chooses the initial states, the same for all methods.
-        threads: Number of threads that may step the worlds; no outcome depends on it.
+        threads: Most threads that step the worlds; no outcome depends on it. None stands for the share of the
+            cores that this process has, see `clbench.worlds.threads.share_cores`.
         lanes: Number of episodes that step together, and of rows in every forward pass.
 
     Raises:
         WrongTypeError: `scenario` is something other than a Scenario, such as an id.
     """
 
-    def __init__(self, scenario: Scenario, seed: int, threads: int = 1, lanes: int = LANES) -> None:
+    def __init__(self, scenario: Scenario, seed: int, threads: int | None = None, lanes: int = LANES) -> None:
         if not isinstance(scenario, Scenario):
             raise WrongTypeError(
                 f"A Scenario is needed, not {scenario!r}: clbench.load_scenario(ID) returns one."
             )
         self.scenario = scenario
         self.seed = seed
-        self._lanes = Lanes(lanes, threads)
+        self._lanes = Lanes(lanes, shared_cores() if threads is None else threads)
         self._warned = False
 
     def close(self) -> None:

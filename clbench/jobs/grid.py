@@ -225,8 +225,8 @@ def run(
         policy: Name of the policy, such as "discrete_diffusion", "flow-base" or "module:Class".
         perturb: Whether the skills and each new target are also evaluated in perturbed worlds.
         records: Folder of the records.
-        workers: Number of runs at once, each a process with one thread; all cores if None, or all GPUs with
-            the device "cuda".
+        workers: Number of runs at once, and of the cores that they share; if None all cores, and with the
+            device "cuda" one run per GPU.
         device: Device that runs the policies, for example "cpu" or "cuda".
 
     Raises:

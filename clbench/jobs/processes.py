@@ -1,4 +1,7 @@
-"""Workers on this machine: processes that each do one job with one thread, or this process."""
+"""Workers on this machine: processes that each do one job, or this process.
+
+A job computes with one thread, so that it repeats bit for bit. Its worlds step with its share of the cores.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ from clbench.base.progress import ProgressCallback, listen
 from clbench.jobs.folders import absolute_places
 from clbench.jobs.job import Event, Job, Outcome
 from clbench.jobs.process_limits import end, end_group, exceeded, signal_group
-from clbench.worlds.threads import cores
+from clbench.worlds.threads import cores, share_cores
 
 SEND_SECONDS = 0.2
 """Shortest time between two progress reports of a worker, in seconds."""
@@ -81,6 +84,9 @@ class Processes:
 
     def __init__(self, count: int | None = None, device: str = "cpu") -> None:
         self._count = count or at_once(device)
+        self._cores = self._count if device == "cpu" else cores()
+        self._share: Any = None
+        """Number of cores of each job, in memory that the jobs share; made with the first one."""
         self._running: dict[Connection, _Worker] = {}
         self._handles_suspension = _handles_suspension()
         if self._handles_suspension:
@@ -95,8 +101,16 @@ class Processes:
         used = [worker.gpu for worker in self._running.values()]
         gpu = min(_gpus(), key=used.count, default=None) if job.device == "cuda" else None
         with _signals_held_back():
-            worker = _start(job, gpu)
+            context = _context()
+            if self._share is None:
+                self._share = context.RawValue("i", 1)
+            worker = _start(context, job, gpu, self._share)
             self._running[worker.connection] = worker
+        self._divide_cores()
+
+    def _divide_cores(self) -> None:
+        """Give each running job an equal share of the cores; its process reads the number at every step."""
+        self._share.value = max(1, self._cores // max(1, len(self._running)))
 
     def events(self) -> Iterator[Event]:
         """Yield the events since the last call; wait at most a second for one."""
@@ -117,6 +131,7 @@ class Processes:
             event = Event(worker.job, kind, value)
             if event.ends_job:
                 del self._running[connection]
+                self._divide_cores()
                 _leave(worker.process)
             yield event
 
@@ -290,14 +305,13 @@ def _context() -> Any:
     return context
 
 
-def _start(job: Job, gpu: str | None) -> _Worker:
-    context = _context()
+def _start(context: Any, job: Job, gpu: str | None, share: Any) -> _Worker:
     ours, theirs = context.Pipe(duplex=False)
     environment = {**os.environ, **absolute_places()}
     if gpu is not None:
         environment["CUDA_VISIBLE_DEVICES"] = gpu
     process = context.Process(
-        target=_work, args=(theirs, job.function, job.arguments, environment), daemon=True
+        target=_work, args=(theirs, job.function, job.arguments, environment, share), daemon=True
     )
     with _script_hidden():
         process.start()
@@ -337,6 +351,7 @@ def _work(
     function: Callable[..., str],
     arguments: dict[str, Any],
     environment: dict[str, str],
+    share: Any,
 ) -> None:
     """Do one job in this process and send its outcome."""
     # this process may be forked from one with an older environment
@@ -354,6 +369,7 @@ def _work(
         except OSError:  # the parent is gone: stop as if killed, so that the run can be resumed
             sys.exit(1)
 
+    share_cores(lambda: int(share.value))
     listen(lambda place, remark: tell("at", (place, remark)))
     tell(*_do_job(function, arguments, functools.partial(tell, "progress")))
 

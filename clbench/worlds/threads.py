@@ -64,21 +64,39 @@ def _quota_of(*files: Path) -> float:
     return quota / period if quota > 0 else math.inf  # version 1 says -1 for no quota
 
 
+_share: Callable[[], int] | None = None
+
+
+def share_cores(share: Callable[[], int] | None) -> None:
+    """Let the teams of this process use at most as many threads as `share` returns, asked at every step.
+
+    A command gives each of its jobs an equal share of the cores, which grows when other jobs end. Without a
+    share (None), teams use all of their threads.
+    """
+    global _share
+    _share = share
+
+
+def shared_cores() -> int:
+    """Return the most threads that a job may use for its worlds: one if it has no share of the cores."""
+    return 1 if _share is None else cores()
+
+
 class Team:
     """Threads, including the calling one, that share work in parallel: MuJoCo releases the interpreter lock.
 
     A team that nobody closes ends with the last reference to it, or when the interpreter exits.
 
     Args:
-        threads: Number of threads.
+        threads: Most threads that work at once, each started when it is first needed. `share_cores` may allow
+            fewer, and so may the machine.
     """
 
     def __init__(self, threads: int) -> None:
+        self._threads = threads
         self._helpers: list[_Helper] = []
-        # must not refer to the team, and comes first: a thread that cannot be started leaves none behind
+        # must not refer to the team
         self._ending = weakref.finalize(self, _end, self._helpers, _PATIENCE)
-        for _ in range(threads - 1):
-            self._helpers.append(_Helper())
 
     def each(self, work: Callable[[Item], None], items: Sequence[Item]) -> None:
         """Do the work on each item, in any order: each thread takes the next item that is left.
@@ -93,8 +111,7 @@ class Team:
                     return
                 work(item)
 
-        # in a forked process, threads of the parent do not live
-        helpers = [one for one in self._helpers[: len(items) - 1] if one.thread.is_alive()] if items else []
+        helpers = self._helpers_for(len(items))
         for helper in helpers:
             helper.asked.put(take)
         try:
@@ -106,6 +123,19 @@ class Team:
             errors = [error for error in [helper.wait() for helper in helpers] if error is not None]
         if errors:
             raise errors[0]
+
+    def _helpers_for(self, items: int) -> list[_Helper]:
+        """Return the threads that work beside the calling one; one that is missing is started."""
+        allowed = self._threads if _share is None else min(self._threads, _share())
+        count = max(0, min(items, allowed) - 1)
+        while len(self._helpers) < count and self._ending.alive:
+            try:
+                self._helpers.append(_Helper())
+            except RuntimeError:  # the machine has no more threads
+                self._threads = len(self._helpers) + 1
+                break
+        # in a forked process, threads of the parent do not live
+        return [one for one in self._helpers[:count] if one.thread.is_alive()]
 
     def close(self) -> None:
         """End the threads and wait for them. A closed team works with the calling thread alone."""

@@ -38,9 +38,10 @@ class VectorWorld(Protocol):
     """Many episodes of one world side by side, each in a lane.
 
     A suite has its own vector world where many episodes step faster together than one after the other. The
-    attribute `vector_world` of its world makes it from the number of lanes and the number of threads. Each
-    episode equals an episode of the plain world bit for bit, whatever the other lanes do. The caller resets a
-    lane before stepping it, counts the steps, and leaves a lane alone once its episode has succeeded.
+    attribute `vector_world` of its world makes it from the number of lanes and the most threads that may
+    step them; a `clbench.worlds.threads.Team` of as many leaves cores to other runs. Each episode equals an
+    episode of the plain world bit for bit, whatever the other lanes do. The caller resets a lane before
+    stepping it, counts the steps, and leaves a lane alone once its episode has succeeded.
 
     The class that makes the episodes, this one or a plain world without a vector world, declares
     `perturbable: ClassVar[bool] = True` if it also takes the keyword argument `perturbed`. Its episodes are

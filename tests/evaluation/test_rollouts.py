@@ -1,4 +1,7 @@
 import dataclasses
+import itertools
+import threading
+from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -21,6 +24,7 @@ from clbench.spec.language import encode
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
+from clbench.worlds.threads import share_cores
 
 TOY = load_scenario("clbench.testing:clbench/Toy-v0")
 FETCH = load_scenario("clbench/Fetch-v1")
@@ -92,6 +96,29 @@ def test_an_outcome_equals_the_outcome_in_the_plain_world_bit_for_bit(fetch_poli
             alone = [_played_alone(policy, task, number, seed=4) for task, _, number in trials]
             for threads in (1, 2):
                 assert Evaluator(scenario, seed=4, threads=threads).play(policy, trials) == alone
+
+
+def test_an_outcome_does_not_depend_on_a_share_of_the_cores_that_changes(
+    fetch_policy: Policy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenario = _with_episodes(validation_episodes=4)
+    tasks, shares, threads = scenario.target[:2], itertools.cycle([1, 3, 2]), set[int]()
+
+    def evaluate() -> list[Episode]:
+        with closing(Evaluator(scenario, seed=0)) as evaluator, deterministic():
+            found = evaluator.evaluate(fetch_policy, tasks)
+            threads.add(threading.active_count())
+            return found
+
+    alone = evaluate()
+    monkeypatch.setattr("clbench.worlds.threads.cores", lambda: 3)
+    share_cores(lambda: next(shares))
+    try:
+        shared = evaluate()
+    finally:
+        share_cores(None)
+    assert shared == alone
+    assert max(threads) - min(threads) == 2  # besides the calling one
 
 
 def test_an_evaluator_asks_for_scenarios_tasks_and_splits_by_kind_and_name(fetch_policy: Policy) -> None:

@@ -26,8 +26,10 @@ from clbench.spec.limits import Limits
 from clbench.worlds.threads import cores
 
 JOBS = """
-import asyncio, multiprocessing, os, signal, subprocess, time
+import asyncio, multiprocessing, os, signal, subprocess, threading, time
 from pathlib import Path
+
+from clbench.worlds.threads import Team
 
 def leaves_a_child(progress, path):
     child = subprocess.Popen(["sleep", "600"])
@@ -86,6 +88,19 @@ def waits_for(progress, begun, end):
     Path(begun).touch()
     while not Path(end).exists():
         time.sleep(0.05)
+    return "went well"
+
+def steps_worlds(progress, awaited, end):
+    # works until its team has had each awaited number of threads; after the first, another job may end
+    team, deadline = Team(8), time.monotonic() + 30
+    for most in awaited:
+        names = set()
+        while len(names) != most and time.monotonic() < deadline:
+            names.clear()
+            team.each(lambda _: (names.add(threading.get_ident()), time.sleep(0.02)), range(16))
+        Path(end).touch()
+        assert len(names) == most, f"{len(names)} threads, not {most}"
+    team.close()
     return "went well"
 
 def moves(progress, folder):
@@ -363,3 +378,17 @@ def test_runs_on_cuda_have_a_gpu_each_and_as_many_go_at_once(
     assert {"run 0: on GPU 3", "run 1: on GPU MIG-5"} <= set(lines)
     assert {"run 2: on GPU 3", "run 2: on GPU MIG-5"} & set(lines)
     assert "names_its_gpu: on GPU 3,MIG-5,6" in lines
+
+
+@pytest.mark.parametrize(("workers", "awaited"), [(4, [2, 4]), (2, [1, 2])])
+def test_the_worlds_of_a_job_step_with_an_equal_share_of_the_workers_which_grows_as_others_end(
+    workers: int, awaited: list[int], tmp_path: Path, bars: Bars
+) -> None:
+    begun, end = str(tmp_path / "begun"), str(tmp_path / "end")
+    jobs = [_job("waits_for", begun=begun, end=end), _job("steps_worlds", awaited=awaited, end=end)]
+    assert run_jobs(jobs, Processes(workers), bars) == {}
+
+
+def test_the_world_of_the_only_worker_steps_with_one_thread(tmp_path: Path, bars: Bars) -> None:
+    jobs = [_job("steps_worlds", awaited=[1, 1], end=str(tmp_path / "end"))]
+    assert run_jobs(jobs, Processes(1), bars) == {}

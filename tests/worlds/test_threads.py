@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from helpers import output_of
 
-from clbench.worlds.threads import Copies, Team, cores
+from clbench.worlds.threads import Copies, Team, cores, share_cores, shared_cores
 
 
 class Owner:
@@ -106,12 +106,59 @@ def test_a_team_that_one_of_its_threads_drops_does_not_wait_for_itself(
         time.sleep(0.01)
 
 
+def test_a_team_uses_as_many_threads_as_the_share_of_its_job_allows_at_the_moment() -> None:
+    team, share = Team(3), [1]
+
+    def check(expected: int) -> None:
+        names, together = set[str](), threading.Barrier(expected)
+
+        def work(_: int) -> None:
+            names.add(threading.current_thread().name)
+            together.wait(timeout=60)
+
+        team.each(work, range(12))
+        assert len(names) == expected
+
+    assert shared_cores() == 1  # this process has no share
+    share_cores(lambda: share[0])
+    try:
+        for share[0], expected in ((1, 1), (2, 2), (8, 3), (1, 1)):
+            check(expected)
+        assert shared_cores() == cores()
+    finally:
+        share_cores(None)
+    check(3)
+    team.close()
+
+
+def test_a_team_goes_on_with_fewer_threads_where_the_machine_has_no_more(
+    before: set[threading.Thread], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tries: list[threading.Thread] = []
+    start = threading.Thread.start
+
+    def start_one(thread: threading.Thread) -> None:
+        tries.append(thread)
+        if len(tries) > 1:
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", start_one)
+    team, done = Team(4), list[int]()
+    for _ in range(2):
+        team.each(done.append, range(6))
+    assert sorted(done) == sorted([*range(6)] * 2)
+    assert len(tries) == 2
+    team.close()
+
+
 def test_a_forked_process_works_with_its_own_thread(before: set[threading.Thread]) -> None:
     # a process of its own: pytest and its workers have threads
     code = (
         "import os\n"
         "from clbench.worlds.threads import Team\n"
         "team, done = Team(3), []\n"
+        "team.each(lambda _: None, range(3))\n"
         "child = os.fork()\n"
         "team.each(done.append, range(5))\n"
         "assert sorted(done) == list(range(5))\n"
@@ -199,6 +246,7 @@ def test_an_interrupted_call_returns_when_no_thread_works_any_more(
             raise KeyboardInterrupt
 
     if at == "the caller waits":
+        team.each(lambda _: None, [1, 2, 3])  # starts the threads
         ended, interrupted = team._helpers[0].ended, list[bool]()
 
         class Queue:

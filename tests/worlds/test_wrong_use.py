@@ -201,6 +201,7 @@ class Threaded(PlainVectorWorld):
     def __init__(self, lanes: int, threads: int) -> None:
         super().__init__(ToyWorld, lanes)
         self._team = Team(threads)
+        self._team.each(lambda _: None, range(threads))  # starts them
 
     def close(self) -> None:
         self._team.close()
