@@ -273,7 +273,7 @@ def run_specs(firsts: Sequence[RunSpec], seeds: int, records: Path, workers: int
     _check_all_done(run_with_bars(needed, Processes(workers), console) if needed else {})
     here, others = [run for run in runs if _is_of_main(run)], [run for run in runs if not _is_of_main(run)]
     failed = run_missing(others, records, lambda: Processes(workers, device), console) if others else {}
-    failed |= run_missing(here, records, Here, console) if here else {}
+    failed |= run_missing(here, records, lambda: Here(workers), console) if here else {}
     _check_all_done(failed)
     return [read_record(run.path(records)) for run in runs]
 

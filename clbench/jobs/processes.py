@@ -114,8 +114,7 @@ class Processes:
 
     def _divide_cores(self) -> None:
         """Give each running job an equal share of the cores; its process reads the number at every step."""
-        share = self._cores // max(1, len(self._running))
-        self._share.value = min(max(1, share), MOST_CORES)
+        self._share.value = _share_of(self._cores, len(self._running))
 
     def events(self) -> Iterator[Event]:
         """Yield the events since the last call; wait at most a second for one."""
@@ -181,10 +180,20 @@ class Processes:
                 end(worker.process.pid)
 
 
-class Here:
-    """This process as a worker: one job at a time, for methods that no other process can import."""
+def _share_of(cores: int, jobs: int) -> int:
+    """Return the number of cores for the worlds of each of `jobs`."""
+    return min(max(1, cores // max(1, jobs)), MOST_CORES)
 
-    def __init__(self) -> None:
+
+class Here:
+    """This process as a worker: one job at a time, for methods that no other process can import.
+
+    Args:
+        count: Number of cores that a job may use for its worlds; all if None.
+    """
+
+    def __init__(self, count: int | None = None) -> None:
+        self._share = _share_of(count or cores(), 1)
         self._job: Job | None = None
         self._thread = threading.Thread()
         self._events: queue.Queue[Event] = queue.Queue()
@@ -207,6 +216,7 @@ class Here:
             self._events.put(Event(job, "progress", amount))
 
         listen(lambda place, remark: self._events.put(Event(job, "at", f"{place} {remark}".strip())))
+        share_cores(lambda: self._share)
         try:
             kind, value = _do_job(job.function, job.arguments, send)
         except SystemExit as leaving:
@@ -215,6 +225,7 @@ class Here:
             kind, value = "failed", f"it ended its process ({leaving})"
         finally:
             listen(None)
+            share_cores(None)
         self._events.put(Event(job, kind, value))
 
     def events(self) -> Iterator[Event]:

@@ -23,7 +23,7 @@ from clbench.jobs.job import Event, Job, Product
 from clbench.jobs.processes import Here, Processes, at_once
 from clbench.jobs.scheduler import run_jobs
 from clbench.spec.limits import Limits
-from clbench.worlds.threads import cores
+from clbench.worlds.threads import cores, shared_cores
 
 JOBS = """
 import asyncio, multiprocessing, os, signal, subprocess, threading, time
@@ -393,6 +393,10 @@ def test_the_worlds_of_a_job_step_with_an_equal_share_of_up_to_8_workers_which_g
     assert run_jobs(jobs, Processes(workers), bars) == {}
 
 
-def test_the_world_of_the_only_worker_steps_with_one_thread(tmp_path: Path, bars: Bars) -> None:
-    jobs = [_job("steps_worlds", awaited=[1, 1], end=str(tmp_path / "end"))]
-    assert run_jobs(jobs, Processes(1), bars) == {}
+@pytest.mark.parametrize(("workers", "threads"), [(Processes, 1), (Here, 1), (Here, 3)])
+def test_the_worlds_of_the_only_job_step_with_as_many_threads_as_there_are_workers(
+    workers: Callable[[int], Processes | Here], threads: int, tmp_path: Path, bars: Bars
+) -> None:
+    job = _job("steps_worlds", awaited=[threads, threads], end=str(tmp_path / "end"))
+    assert run_jobs([job], workers(threads), bars) == {}
+    assert shared_cores() == 1  # no share is left in this process
