@@ -1,10 +1,10 @@
 """Time and memory of a whole run, by its parts: `python benchmarks/whole_run.py ID`.
 
-It times one run of plain fine-tuning with one thread, as in `clbench run`, with its data and its pretrained
-policy in the cache. Clocks measure the physics, the pictures and the policy of all evaluations and checks;
-training is the time of the stages' loops without them. All else is other: reading files, questions, probes of
-the policy, checkpoints, and the optimiser steps of relearning. The current speed of the machine is given too:
-matrix products of a policy's size, in GFLOPS, before and after.
+It times one run of plain fine-tuning with one thread, as in `clbench run` where other runs need all other
+cores, with its data and its pretrained policy in the cache. Clocks measure the physics, the pictures and the
+policy of all evaluations and checks; training is the time of the stages' loops without them. All else is
+other: reading files, questions, probes of the policy, checkpoints, and the optimiser steps of relearning. The
+current speed of the machine is given too: matrix products of a policy's size, in GFLOPS, before and after.
 """
 
 from __future__ import annotations
