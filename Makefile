@@ -202,8 +202,8 @@ clean:
 	rm -rf .venv build dist
 
 $(BIN)/pip:
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)) and \
-	  "clbench needs Python 3.11 or 3.12, not %d.%d: name one with make PYTHON=python3.12" % sys.version_info[:2])'
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12), (3, 13)) and \
+	  "clbench needs Python 3.11, 3.12 or 3.13, not %d.%d: name one with make PYTHON=python3.12" % sys.version_info[:2])'
 	$(PYTHON) -m venv .venv
 # Python 3.11 brings pip 23.2, which takes 41 s of processor time for the packages that pip 26.3 installs in 21 s.
 	$(BIN)/pip install -q -U pip

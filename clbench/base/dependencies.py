@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import platform
 from collections.abc import Iterable
 from importlib import metadata
 from importlib.util import find_spec
@@ -54,9 +55,7 @@ def require_packages(packages: Iterable[str], purpose: str) -> None:
     """
     for package in sorted(packages):
         if not is_installed(package):
-            raise MissingPackageError(
-                f"{purpose} needs the package {package}: pip install {_wanted(package)}"
-            )
+            raise MissingPackageError(f"{purpose} needs the package {package}{_way_to(package)}")
 
 
 def is_installed(package: str) -> bool:
@@ -73,11 +72,19 @@ def extra_of(requirement: Requirement) -> str:
     return str(requirement.marker).partition("==")[2].strip(" \"'") if requirement.marker else ""
 
 
-def _wanted(package: str) -> str:
-    """Return the argument of `pip install` for a distribution: its extra of clbench, else itself."""
+def is_for_this_python(requirement: Requirement) -> bool:
+    """Return whether clbench has a requirement, or one of an extra, with this version of Python."""
+    return requirement.marker is None or requirement.marker.evaluate({"extra": extra_of(requirement)})
+
+
+def _way_to(package: str) -> str:
+    """Return how to get a distribution, as the end of a sentence: by its extra of clbench, or by itself."""
     for requirement in map(Requirement, metadata.requires("clbench") or []):
-        if canonicalize_name(requirement.name) == canonicalize_name(package) and extra_of(
-            requirement
-        ) not in ("", "dev"):
-            return f"'clbench[{extra_of(requirement)}]'"
-    return package
+        if canonicalize_name(requirement.name) != canonicalize_name(package):
+            continue
+        if not is_for_this_python(requirement):
+            here = platform.python_version()
+            return f", which clbench uses only where {requirement.marker}: this is Python {here}"
+        if extra_of(requirement) not in ("", "dev"):
+            return f": pip install 'clbench[{extra_of(requirement)}]'"
+    return f": pip install {package}"

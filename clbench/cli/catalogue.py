@@ -19,7 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from clbench import __version__
-from clbench.base.dependencies import extra_of
+from clbench.base.dependencies import extra_of, is_for_this_python
 from clbench.base.errors import InputError
 from clbench.base.leftovers import replacing
 from clbench.base.text import megabytes, print_plain, printable
@@ -276,7 +276,7 @@ def _packages() -> list[_Package]:
     for text in requires("clbench") or []:
         requirement = Requirement(text)
         extra = extra_of(requirement)
-        if extra == "dev":
+        if extra == "dev" or not is_for_this_python(requirement):
             continue
         requirement.marker = None
         try:

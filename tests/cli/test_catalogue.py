@@ -51,6 +51,19 @@ def test_doctor_advises_the_extra_of_a_package_too(
 
 
 @pytest.mark.long
+def test_doctor_does_not_miss_packages_for_other_versions_of_python(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted = ["numpy>=2", "no-simulator==1; python_version < '3'"]
+    monkeypatch.setattr("clbench.cli.catalogue.requires", lambda _: wanted)
+    app(["doctor"], result_action="return_value")
+    shown = capsys.readouterr().out
+    assert "numpy" in shown
+    assert "no-simulator" not in shown
+    assert shown.splitlines()[-1].endswith("is ready.")
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("fault", ["cannot be written to: Not a directory", "no home folder"])
 def test_doctor_says_that_nothing_can_run_without_a_folder_for_data(
     fault: str, empty_caches: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

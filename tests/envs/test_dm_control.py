@@ -11,6 +11,8 @@ import pytest
 from helpers import back_end_or_skip
 from numpy.typing import NDArray
 
+pytest.importorskip("dm_control", reason="dm-control is not for this version of Python")
+
 from clbench.base.entry_points import resolve
 from clbench.data.demonstrations import demonstrate
 from clbench.exchange.shown import steps_per_second

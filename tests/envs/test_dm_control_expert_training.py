@@ -13,6 +13,7 @@ import pytest
 
 from clbench.base.seeding import seeded
 
+pytest.importorskip("dm_control", reason="dm-control is not for this version of Python")
 SAC = pytest.importorskip("stable_baselines3", reason="the extra online is not installed").SAC
 expert, sac, training = (
     importlib.import_module(f"clbench.envs.dm_control.{name}")

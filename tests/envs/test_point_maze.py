@@ -23,7 +23,7 @@ from clbench.base.seeding import derive_seed
 from clbench.data import demonstrations, expert_rates
 from clbench.data.questions import load_questions, scored_questions
 from clbench.spec.language import word_id
-from clbench.spec.registry import load_scenario
+from clbench.spec.registry import load_scenario, registered_scenario
 from clbench.spec.task import Task
 from clbench.worlds.lanes import vector_world
 from clbench.worlds.perturbation import draw_perturbation
@@ -336,7 +336,7 @@ def test_seeds_and_data_set_ids_keep_the_old_spelling_of_the_suite(monkeypatch: 
 
 def test_suites_have_one_spelling_and_seeds_keep_the_old_one() -> None:
     names = ("Fetch-v1", "FetchPixels-v0", "DMControl-v0", "MetaWorld-v1", "MetaWorldCW-v0")
-    scenarios = [load_scenario(f"clbench:clbench/{name}") for name in names]
+    scenarios = [registered_scenario(f"clbench:clbench/{name}") for name in names]
     spellings = [{task.seed_suite for task in scenario.target} for scenario in scenarios]
     assert spellings == [{"fetch_tidy"}, {"fetch-pixels"}, {"dm_control"}, {"metaworld"}, {"metaworld-cw"}]
     suites = [{task.suite for task in scenario.tasks} for scenario in scenarios]

@@ -1,6 +1,7 @@
 import dataclasses
 import importlib.metadata
 import math
+import platform
 from collections.abc import Iterator
 from typing import Any
 
@@ -96,6 +97,18 @@ def test_a_package_of_an_extra_is_installed_as_the_extra(monkeypatch: pytest.Mon
         require_packages(["pillow"], "A film")
 
 
+def test_a_package_for_other_versions_of_python_is_not_to_be_installed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    wanted = ["numpy>=2", "no-simulator==1; python_version < '3'", "no-game==2; python_version > '3'"]
+    monkeypatch.setattr(importlib.metadata, "requires", lambda _: wanted)
+    reason = f'which clbench uses only where python_version < "3": this is Python {platform.python_version()}'
+    with pytest.raises(LookupError, match=f"me/World-v0 needs the package no-simulator, {reason}$"):
+        require_packages(["no-simulator"], "me/World-v0")
+    with pytest.raises(LookupError, match=r"me/World-v0 needs the package no-game: pip install no-game$"):
+        require_packages(["no-game"], "me/World-v0")
+
+
 def test_the_fetch_scenario_has_the_promised_parts() -> None:
     scenario = load_scenario(FETCH)
     assert len(scenario.retained) >= 3
@@ -179,7 +192,7 @@ def test_all_orders_are_different_permutations_and_the_first_is_the_published_on
 @pytest.mark.parametrize("order", [-1, 24])
 def test_an_unknown_order_is_refused_with_the_known_ones(order: int) -> None:
     with pytest.raises(ValueError, match=rf"{PUBLISHED}: 4 targets have orders 0 to 23, not {order}"):
-        load_scenario(PUBLISHED).in_order(order)
+        registered_scenario(PUBLISHED).in_order(order)
 
 
 def test_an_order_never_changes() -> None:
@@ -188,7 +201,7 @@ def test_an_order_never_changes() -> None:
 
 
 def test_in_another_order_nothing_but_the_targets_differs() -> None:
-    published = load_scenario(PUBLISHED)
+    published = registered_scenario(PUBLISHED)
     other = published.in_order(1)
     assert [task.name for task in other.target] == [published.target[index].name for index in (3, 2, 1, 0)]
     assert dataclasses.replace(other, target=published.target) == published
