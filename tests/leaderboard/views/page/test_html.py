@@ -306,7 +306,7 @@ def test_definitions_that_rank_in_opposite_orders_are_named(add: Callable[..., P
     (table,) = (
         one for one in by_id(document, "clbench/Two-v0").iter("table") if one.get("class") == "definitions"
     )
-    ranks = {words(row[0]): [words(cell) for cell in row[1:3]] for row in table.find("tbody") or []}
+    ranks = {words(row[0]): [words(cell) for cell in row[1:3]] for row in table.iterfind("tbody/tr")}
     assert ranks["skills"] == ["4 , depends on the definition", "1"]
     assert ranks["targets"] == ["3 , depends on the definition", "4"]
     assert ranks["neither"] == ["1", "1"]
