@@ -26,7 +26,7 @@ from clbench.spec.protocol import SPLITS, Split
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 from clbench.worlds.lanes import Lanes
-from clbench.worlds.threads import shared_cores
+from clbench.worlds.threads import threads_of_job
 
 LOG = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ class Evaluator:
             )
         self.scenario = scenario
         self.seed = seed
-        self._lanes = Lanes(lanes, shared_cores() if threads is None else threads)
+        self._lanes = Lanes(lanes, threads_of_job() if threads is None else threads)
         self._warned = False
 
     def close(self) -> None:

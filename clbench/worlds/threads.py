@@ -77,8 +77,8 @@ def share_cores(share: Callable[[], int] | None) -> None:
     _share = share
 
 
-def shared_cores() -> int:
-    """Return the most threads that a job may use for its worlds: one if it has no share of the cores."""
+def threads_of_job() -> int:
+    """Return the most threads that the worlds of a job may use: one if it has no share of the cores."""
     return 1 if _share is None else cores()
 
 
@@ -95,7 +95,7 @@ class Team:
     def __init__(self, threads: int) -> None:
         self._threads = threads
         self._helpers: list[_Helper] = []
-        # must not refer to the team
+        # what it calls must not refer to the team
         self._ending = weakref.finalize(self, _end, self._helpers, _PATIENCE)
 
     def each(self, work: Callable[[Item], None], items: Sequence[Item]) -> None:

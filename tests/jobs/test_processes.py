@@ -23,7 +23,7 @@ from clbench.jobs.job import Event, Job, Product
 from clbench.jobs.processes import Here, Processes, at_once
 from clbench.jobs.scheduler import run_jobs
 from clbench.spec.limits import Limits
-from clbench.worlds.threads import cores, shared_cores
+from clbench.worlds.threads import cores, threads_of_job
 
 JOBS = """
 import asyncio, multiprocessing, os, signal, subprocess, threading, time
@@ -399,4 +399,4 @@ def test_the_worlds_of_the_only_job_step_with_as_many_threads_as_there_are_worke
 ) -> None:
     job = _job("steps_worlds", awaited=[threads, threads], end=str(tmp_path / "end"))
     assert run_jobs([job], workers(threads), bars) == {}
-    assert shared_cores() == 1  # no share is left in this process
+    assert threads_of_job() == 1  # no share is left in this process

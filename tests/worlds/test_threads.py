@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from helpers import output_of
 
-from clbench.worlds.threads import Copies, Team, cores, share_cores, shared_cores
+from clbench.worlds.threads import Copies, Team, cores, share_cores, threads_of_job
 
 
 class Owner:
@@ -119,12 +119,12 @@ def test_a_team_uses_as_many_threads_as_the_share_of_its_job_allows_at_the_momen
         team.each(work, range(12))
         assert len(names) == expected
 
-    assert shared_cores() == 1  # this process has no share
+    assert threads_of_job() == 1  # this process has no share
     share_cores(lambda: share[0])
     try:
         for share[0], expected in ((1, 1), (2, 2), (8, 3), (1, 1)):
             check(expected)
-        assert shared_cores() == cores()
+        assert threads_of_job() == cores()
     finally:
         share_cores(None)
     check(3)
