@@ -80,8 +80,8 @@ def replay(subject: Subject, progress: ProgressCallback) -> list[Check]:
                 _start(subject, policies[0], progress),
             ]
         checks += [_replay_episodes(subject, policies), _replay_answers(subject, policies)]
-    if subject.scenario.budget.criterion:
-        checks += _replay_ends(subject, policies, lengths)
+        if subject.scenario.budget.criterion:
+            checks += _replay_ends(subject, policies, lengths)
     if kept is not None:
         checks.append(_go_on(subject, kept, policies))
     return checks

@@ -225,6 +225,30 @@ def test_a_stage_that_is_said_to_have_learned_its_target_earlier_is_refused(tmp_
 
 
 @pytest.mark.long
+def test_every_episode_is_replayed_with_the_one_thread_of_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = RunSpec(EAGER.id, "frozen", 0)
+    execute(spec, tmp_path / "records")
+    play, threads = Evaluator.play, []
+
+    def watched(*arguments: Any, **options: Any) -> Any:
+        threads.append(torch.get_num_threads())
+        return play(*arguments, **options)
+
+    monkeypatch.setattr(Evaluator, "play", watched)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        assert failures(verify(spec.path(tmp_path / "records"), "replayed", scenario=EAGER.id)) == ""
+    finally:
+        torch.set_num_threads(before)
+    stages = len(EAGER.target)
+    assert len(threads) >= (stages + 1) + stages  # the ends of stages, and the last checks of the targets
+    assert set(threads) == {1}
+
+
+@pytest.mark.long
 def test_a_tuning_run_is_verified_like_any_other(tmp_path: Path) -> None:
     spec = RunSpec(TOY, "frozen", 100, {"step_factor": 0.3}, split="validation")
     execute(spec, tmp_path / "records")
