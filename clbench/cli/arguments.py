@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated, Any, get_args
 
 from cyclopts import (
     App,
@@ -97,6 +97,15 @@ def items_of(option: str, text: str) -> list[str]:
     if "" in items:
         raise InputError(f"{option} has an empty item: {text!r}. Separate items with single commas.")
     return list(dict.fromkeys(items))
+
+
+def chosen_pictures(cameras: str | None, size: int | None) -> dict[str, Any]:
+    """Return the arguments `pictures` and `picture_size` that --pictures and --picture-size stand for."""
+    with checked_input():
+        if cameras is None and size is not None:
+            raise InputError("--picture-size needs --pictures: name the cameras there.")
+        chosen = [] if cameras is None else items_of("--pictures", cameras)
+    return {"pictures": chosen, **({} if size is None else {"picture_size": size})}
 
 
 def chosen_methods(methods: Iterable[str], every: bool) -> list[str]:

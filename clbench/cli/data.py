@@ -23,6 +23,7 @@ from clbench.cli.arguments import (
     Seed,
     add_cwd_to_path,
     checked_input,
+    chosen_pictures,
     whole_number,
 )
 from clbench.jobs.folders import check_folders
@@ -94,6 +95,8 @@ def export(
     format: Literal["lerobot", "hdf5"],  # noqa: A002 - the word that everyone uses
     output: Path,
     noisy: Annotated[bool, Parameter(negative="--no-noisy")] = True,
+    pictures: str | None = None,
+    picture_size: Annotated[int | None, whole_number(1)] = None,
     workers: Annotated[int | None, whole_number(1)] = None,
 ) -> None:
     """Export the demonstrations of SCENARIO, or of TASKS alone, for other libraries.
@@ -108,20 +111,34 @@ def export(
             TASK_demo.hdf5 for each task, in the layout of robomimic and LIBERO.
         output: New folder.
         noisy: Whether to export the episodes with action noise, too: --no-noisy leaves them out.
+        pictures: Cameras of the simulator whose pictures to add, separated by commas, for example
+            agentview,robot0_eye_in_hand: what `clbench score --pictures` shows a policy. Drawing them can
+            take hours.
+        picture_size: Height and width of these pictures in pixels (default: 224).
         workers: Number of tasks to collect at once (default: all cores).
     """
     from clbench.exchange.demonstrations import check_output, chosen_tasks, export_demonstrations
+    from clbench.jobs.bars import Bars
 
     add_cwd_to_path()
+    drawn = chosen_pictures(pictures, picture_size)
     with checked_input():
         loaded, chosen = chosen_tasks(scenario, tasks)
-        check_output(output, format, chosen)
+        check_output(output, format, chosen, **drawn)
         check_folders({"--output": output})
     _collect(scenario, loaded, chosen, workers)
-    with checked_input():
+    with checked_input(), Bars(1.0) as bars:
+        bars.start("export", 1.0)
         folder = export_demonstrations(
-            loaded, output, format=format, tasks=[task.name for task in chosen], noisy=noisy
+            loaded,
+            output,
+            format=format,
+            tasks=[task.name for task in chosen],
+            noisy=noisy,
+            **drawn,
+            progress=lambda share: bars.advance("export", share),
         )
+        bars.finish("export", "done")
     text = f"{counted(len(chosen), 'task')} of {loaded.id} in {folder}"
     print_plain(Console(), text)
 

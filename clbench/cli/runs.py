@@ -27,6 +27,7 @@ from clbench.cli.arguments import (
     check_names,
     checked_input,
     chosen_methods,
+    chosen_pictures,
     items_of,
     whole_number,
 )
@@ -201,7 +202,7 @@ def score(
         "executed": executed,
         "data": data,
         "steps": steps,
-        **_pictures(pictures, picture_size),
+        **chosen_pictures(pictures, picture_size),
         "restart": restart,
         "records": records,
     }
@@ -226,15 +227,6 @@ def score(
     else:
         then = f"Record: {path}\nThis is a tuning run on validation episodes, so no board shows it."
     print_plain(console, then)
-
-
-def _pictures(cameras: str | None, size: int | None) -> dict[str, Any]:
-    """Return the options of `score` on pictures."""
-    with checked_input():
-        if cameras is None and size is not None:
-            raise InputError("--picture-size needs --pictures: name the cameras there.")
-        chosen = [] if cameras is None else items_of("--pictures", cameras)
-    return {"pictures": chosen, **({} if size is None else {"picture_size": size})}
 
 
 def _rates(record: Record) -> str:

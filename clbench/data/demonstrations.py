@@ -56,6 +56,8 @@ class Demonstration:
     """Rewards, (T,)."""
     success: bool
     """Whether the episode ended in success."""
+    seed: int | None = None
+    """Seed of the initial state; None if the demonstration was recorded elsewhere."""
 
 
 def demonstrate(world: World, task: Task, seed: int, noisy: bool) -> Demonstration:
@@ -113,6 +115,7 @@ def demonstrate(world: World, task: Task, seed: int, noisy: bool) -> Demonstrati
         np.array([*random, False]),
         np.array(rewards),
         success,
+        seed,
     )
 
 
@@ -256,6 +259,7 @@ def _write_dataset(
         buffers.append(
             EpisodeBuffer(
                 id=number,
+                seed=episode.seed,
                 observations=list(episode.state),
                 actions=list(episode.executed),
                 rewards=list(episode.reward),
@@ -291,10 +295,15 @@ def read_dataset(folder: Path) -> list[Demonstration]:
     from minari.dataset.minari_storage import MinariStorage
 
     storage = MinariStorage.read(folder / "data")
-    return [_demonstration(episode) for episode in storage.get_episodes(range(storage.total_episodes))]
+    numbers = range(storage.total_episodes)
+    facts = storage.get_episode_metadata(numbers)
+    return [
+        _demonstration(episode, fact.get("seed"))
+        for episode, fact in zip(storage.get_episodes(numbers), facts, strict=True)
+    ]
 
 
-def _demonstration(episode: dict[str, Any]) -> Demonstration:
+def _demonstration(episode: dict[str, Any], seed: int | None) -> Demonstration:
     return Demonstration(
         np.asarray(episode["observations"], np.float32),
         np.asarray(episode["actions"], np.float32),
@@ -302,6 +311,7 @@ def _demonstration(episode: dict[str, Any]) -> Demonstration:
         np.asarray(episode["infos"]["noisy"], np.bool_),
         np.asarray(episode["rewards"], np.float64),
         bool(episode["terminations"][-1]),
+        seed,
     )
 
 

@@ -6,6 +6,8 @@ import logging
 import os
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -15,6 +17,7 @@ from clbench.base.dependencies import require
 from clbench.base.entry_points import unknown
 from clbench.base.errors import InputError
 from clbench.base.leftovers import unfinished
+from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.text import counted
 from clbench.data.access import check_demonstrations
 from clbench.data.demonstrations import (
@@ -25,6 +28,7 @@ from clbench.data.demonstrations import (
     read_dataset,
 )
 from clbench.evaluation.definition import recording_of
+from clbench.evaluation.views import SIZE, SimulatorCameras
 from clbench.exchange.recorded import expert_of, recording_hash
 from clbench.exchange.shown import steps_per_second
 from clbench.spec.registry import load_scenario
@@ -44,10 +48,14 @@ def export_demonstrations(
     format: Format,  # noqa: A002 - the word that everyone uses
     tasks: Iterable[str] = (),
     noisy: bool = True,
+    pictures: Sequence[str] = (),
+    picture_size: int = SIZE,
+    progress: ProgressCallback = no_progress,
 ) -> Path:
     """Export demonstrations, which are collected on first use, and return the folder that holds them.
 
-    A warning names the numbers of the actions that never change in the export.
+    A warning names the numbers of the actions that never change in the export. For `pictures`, the episodes
+    are played again: they are what `clbench.serving.score.score` shows a policy with the same cameras.
 
     Args:
         scenario: Scenario, or its Gymnasium id.
@@ -56,23 +64,34 @@ def export_demonstrations(
             `TASK_demo.hdf5`, in the layout of robomimic and LIBERO.
         tasks: Names of tasks, or one name; if empty, the retained skills and the targets.
         noisy: Whether to export the episodes with action noise, too.
+        pictures: Cameras of the simulator whose pictures to add, for example ("agentview",).
+        picture_size: Height and width of these pictures in pixels.
+        progress: Called with the share of the episodes that were written since its last call.
 
     Raises:
-        InputError: The folder exists or cannot be made, a world does not give its steps per second, or a task
-            has no episode without action noise.
+        InputError: The folder exists or cannot be made, a world does not give its steps per second, a task
+            has no episode without action noise, or the demonstrations cannot have these pictures.
         UnknownNameError: The format or a name is unknown.
         MissingPackageError: A package is not installed.
         LeakError: The running hooks of a method must not read them.
-        RenderingError: The tasks have a camera, and no back end of this machine can draw.
+        RenderingError: The tasks have a camera or `pictures` are asked for, and this machine cannot draw.
     """
     loaded, chosen = chosen_tasks(scenario, tasks)
-    folder = check_output(output, format, chosen)
+    folder = check_output(output, format, chosen, pictures, picture_size)
     for task in chosen:
         check_demonstrations(task.name)
     found = {task: read_dataset(dataset_folder(task, loaded.budget)) for task in chosen}
     if not noisy:
         found = {task: _without_noise(task, episodes) for task, episodes in found.items()}
-    exported = _in_one_step(folder, lambda partial: _WRITERS[format](partial, found))
+    count = sum(map(len, found.values()))
+    with closing(SimulatorCameras(pictures, picture_size)) as cameras:
+        fill = partial(
+            _WRITERS[format],
+            tasks=found,
+            cameras=cameras if pictures else None,
+            progress=lambda written: progress(written / count),
+        )
+        exported = _in_one_step(folder, fill)
     _warn_if_constant(found.values())
     return exported
 
@@ -92,25 +111,42 @@ def check_output(
     output: Path | str,
     format: str,  # noqa: A002 - as in `export_demonstrations`
     tasks: Sequence[Task],
+    pictures: Sequence[str] = (),
+    picture_size: int = SIZE,
 ) -> Path:
     """Check the output of an export before any work starts, and return its folder.
 
     Raises:
-        InputError: The folder exists, or a world does not give its steps per second.
-        UnknownNameError: There is no such format.
+        InputError: The folder exists, a world does not give its steps per second, or the demonstrations
+            cannot have these pictures.
+        UnknownNameError: There is no such format or camera.
         MissingPackageError: A package that the format needs is not installed.
     """
     if format not in get_args(Format):
         raise unknown("format", format, get_args(Format))
     if format == "lerobot":
         require("pyarrow", "exchange", "A LeRobotDataset")
-        if any(task.camera is not None for task in tasks):
+        if pictures or any(task.camera is not None for task in tasks):
             require("PIL", "film", "A LeRobotDataset with pictures")
     for task in {task.world: task for task in tasks}.values():
         steps_per_second(task)
     if os.path.lexists(output):
         raise InputError(f"{output} already exists: name a new folder for the export.")
+    with closing(SimulatorCameras(pictures, picture_size)) as cameras:
+        if pictures:
+            _check_replayable(tasks)
+            cameras.check(tasks)
     return Path(output)
+
+
+def _check_replayable(tasks: Iterable[Task]) -> None:
+    """Refuse tasks whose demonstrations cannot be played again for pictures."""
+    for task in tasks:
+        if recording_of(task) is not None:
+            raise InputError(
+                f"The demonstrations of {task.name} have no pictures of the simulator's cameras: they were "
+                "recorded elsewhere, and clbench does not know the scenes in which they began."
+            )
 
 
 def _without_noise(task: Task, episodes: Sequence[Demonstration]) -> list[Demonstration]:
@@ -136,17 +172,27 @@ def _warn_if_constant(tasks: Iterable[Sequence[Demonstration]]) -> None:
         )
 
 
-def _write_files(folder: Path, tasks: Mapping[Task, Sequence[Demonstration]]) -> None:
+def _write_files(
+    folder: Path,
+    tasks: Mapping[Task, Sequence[Demonstration]],
+    cameras: SimulatorCameras | None,
+    progress: ProgressCallback,
+) -> None:
     from clbench.exchange.hdf5 import write_hdf5
 
     for task, episodes in tasks.items():
-        write_hdf5(folder / f"{task.name}_demo.hdf5", task, episodes)
+        write_hdf5(folder / f"{task.name}_demo.hdf5", task, episodes, cameras, progress)
 
 
-def _write_dataset(folder: Path, tasks: Mapping[Task, Sequence[Demonstration]]) -> None:
+def _write_dataset(
+    folder: Path,
+    tasks: Mapping[Task, Sequence[Demonstration]],
+    cameras: SimulatorCameras | None,
+    progress: ProgressCallback,
+) -> None:
     from clbench.exchange.lerobot import write_lerobot
 
-    write_lerobot(folder, tasks)
+    write_lerobot(folder, tasks, cameras, progress)
 
 
 _WRITERS = {"lerobot": _write_dataset, "hdf5": _write_files}
@@ -158,16 +204,16 @@ def _in_one_step(folder: Path, fill: Callable[[Path], None]) -> Path:
     Raises:
         InputError: The folder cannot be made.
     """
-    partial = unfinished(folder)
+    incomplete = unfinished(folder)
     try:
-        partial.absolute().mkdir(parents=True)
+        incomplete.absolute().mkdir(parents=True)
     except OSError as error:
         raise InputError(f"{folder} cannot be made: {error.strerror}.") from error
     try:
-        fill(partial)
-        return partial.rename(folder)
+        fill(incomplete)
+        return incomplete.rename(folder)
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        shutil.rmtree(incomplete, ignore_errors=True)
 
 
 def import_demonstrations(

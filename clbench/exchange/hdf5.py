@@ -26,8 +26,10 @@ from numpy.typing import NDArray
 
 from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError
+from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.text import counted, did_you_mean, quoted
 from clbench.data.demonstrations import Demonstration
+from clbench.evaluation.views import SimulatorCameras
 from clbench.exchange.shown import shown, steps_per_second
 from clbench.spec.language import LENGTHS, UnknownWordError, word_ids
 from clbench.spec.task import Task
@@ -52,22 +54,31 @@ _DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError
 # ---- out ---------------------------------------------------------------------------------------------------
 
 
-def write_hdf5(path: Path, task: Task, episodes: Sequence[Demonstration]) -> None:
+def write_hdf5(
+    path: Path,
+    task: Task,
+    episodes: Sequence[Demonstration],
+    cameras: SimulatorCameras | None = None,
+    progress: ProgressCallback = no_progress,
+) -> None:
     """Write the demonstrations of a task to an HDF5 file.
 
     Args:
         path: The file, which must not exist.
         task: Task of the demonstrations.
         episodes: The demonstrations.
+        cameras: Cameras of the simulator whose pictures to add, named as in robomimic; None adds none.
+        progress: Called with the number of episodes written since its last call.
 
     Raises:
-        InputError: The world of the task does not give its steps per second.
-        RenderingError: The task has a camera, and no back end of this machine can draw.
+        InputError: The world of the task does not give its steps per second, or an episode cannot be played
+            again.
+        RenderingError: The task has a camera or `cameras` are given, and this machine cannot draw.
     """
     with h5py.File(path, "x") as file:
         data = file.create_group("data")
         data.attrs.update(_attributes(task, episodes))
-        for number, one in enumerate(shown(task, episodes)):
+        for number, one in enumerate(shown(task, episodes, cameras)):
             episode, group = one.episode, data.create_group(f"demo_{number}")
             group.attrs["num_samples"] = len(episode.executed)
             group["actions"], group["executed"] = episode.expert[:-1], episode.executed
@@ -76,8 +87,12 @@ def write_hdf5(path: Path, task: Task, episodes: Sequence[Demonstration]) -> Non
             group["noisy"] = episode.noisy[:-1]
             group["final_state"], group["final_action"] = episode.state[-1], episode.expert[-1]
             group["obs/state"] = one.state
+            pictures = {f"obs/{name}_image": pictures for name, pictures in one.pictures.items()}
             if one.image.size:
-                group.create_dataset("obs/image", data=one.image, compression="gzip")
+                pictures["obs/image"] = one.image
+            for name, values in pictures.items():
+                group.create_dataset(name, data=values, compression="gzip")
+            progress(1)
 
 
 def _dones(episode: Demonstration) -> NDArray[np.uint8]:

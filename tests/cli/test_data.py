@@ -152,6 +152,11 @@ clbench.register("me/Lazy-v0", "lazy_left:SCENARIO")
         (["export", TOY, "lft", "--format", "hdf5", "--output", "x"], "Did you mean 'left'?"),
         (["export", TOY, "--format", "hdf", "--output", "x"], 'Invalid value "hdf" for --format'),
         (["export", TOY, "--format", "hdf5"], "--output requires an argument"),
+        (
+            ["export", TOY, "--format", "hdf5", "--output", "x", "--picture-size", "64"],
+            "--picture-size needs --pictures",
+        ),
+        (["export", TOY, "--format", "hdf5", "--output", "x", "--pictures", "front"], "has no pictures"),
         (["import", TOY, "left", "x.hdf5"], "There is no file x.hdf5."),
         (["import", TOY, "left", "x.hdf5", "--state"], "The state must name datasets of a demonstration"),
     ],

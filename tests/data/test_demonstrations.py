@@ -81,6 +81,17 @@ def test_a_dataset_recovers_the_environment_that_made_it(empty_caches: Path) -> 
         assert env.reset(options={"task": "up"})[1]["task"] == "up"
 
 
+def test_the_seed_of_an_episode_leads_to_its_first_state(empty_caches: Path) -> None:
+    dataset_folder(TASK, BUDGET)
+    dataset = minari.load_dataset(dataset_id(TASK, BUDGET))
+    seeds = [facts["seed"] for facts in dataset.storage.get_episode_metadata(range(5))]
+    assert len({*seeds}) == 5
+    with contextlib.closing(dataset.recover_environment()) as env:
+        for seed, episode in zip(seeds, dataset, strict=True):
+            state, _ = env.reset(seed=seed)
+            assert np.array_equal(state, episode.observations[0])
+
+
 def test_two_budgets_or_versions_never_share_a_folder(empty_caches: Path) -> None:
     others = (
         (TASK, dataclasses.replace(BUDGET, demonstrations=3)),

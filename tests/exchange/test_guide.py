@@ -5,7 +5,7 @@ import shlex
 from pathlib import Path
 
 import pytest
-from helpers import blocks_of
+from helpers import blocks_of, scenario_or_skip
 
 from clbench import export_demonstrations
 from clbench.cli.main import app
@@ -43,6 +43,23 @@ def test_its_commands_on_a_recording_do_what_it_says(
     Path("recorded.py").write_text(re.sub('expert=".+?"', told, source), encoding="utf-8")
     app(imported, result_action="return_value")
     assert re.fullmatch(r"clbench/toy/[0-9a-f]{16}/right-v0\n", capsys.readouterr().out)
+
+
+def test_its_export_with_pictures_is_a_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (block,) = blocks_of(PAGE, "shell")
+    _, *command = shlex.split(block.replace("\\\n", " "))
+    scenario_or_skip(command[2])
+    with pytest.raises(SystemExit):
+        app([*command[:-1], str(tmp_path)])
+    assert f"{tmp_path} already exists: name a new folder for the export" in capsys.readouterr().err
+    # the cameras are those of the scene, and another name would be refused before any work
+    place = command.index("--pictures") + 1
+    with pytest.raises(SystemExit):
+        app([*command[:place], f"{command[place]},agent", *command[place + 1 : -1], str(tmp_path / "new")])
+    assert "Did you mean 'agentview'?" in capsys.readouterr().err
 
 
 def test_its_exports_are_commands(

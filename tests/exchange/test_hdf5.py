@@ -17,7 +17,7 @@ from helpers import same_demonstrations
 from clbench import export_demonstrations
 from clbench.base.errors import InputError
 from clbench.data.access import LeakError, hooks
-from clbench.data.demonstrations import Demonstrations, dataset_folder, read_dataset
+from clbench.data.demonstrations import Demonstration, Demonstrations, dataset_folder, read_dataset
 from clbench.exchange.hdf5 import read_hdf5
 from clbench.spec.task import Task
 from clbench.testing import TOY
@@ -63,8 +63,13 @@ def libero(tmp_path: Path) -> Path:
     return path
 
 
+def _without_seeds(episodes: list[Demonstration]) -> list[Demonstration]:
+    """Return episodes as a file keeps them."""
+    return [dataclasses.replace(episode, seed=None) for episode in episodes]
+
+
 def test_an_exported_file_comes_back_bit_for_bit(exported: Path) -> None:
-    before = read_dataset(dataset_folder(TASK, TOY.budget))
+    before = _without_seeds(read_dataset(dataset_folder(TASK, TOY.budget)))
     after = read_hdf5(exported, TASK)
     assert same_demonstrations(after, before)
     for one, other in zip(after, before, strict=True):
@@ -111,9 +116,8 @@ def test_a_file_of_a_task_with_a_camera_has_what_a_policy_sees(tmp_path: Path) -
         assert demo["obs/image"].shape == (demo.attrs["num_samples"], 16, 16, 3)
         assert demo["obs/image"].dtype == np.uint8
         assert np.array_equal(demo["obs/state"], demo["states"][:, :1])
-    assert same_demonstrations(
-        read_hdf5(folder / "right_demo.hdf5", seen), read_dataset(dataset_folder(seen, TOY.budget))
-    )
+    before = _without_seeds(read_dataset(dataset_folder(seen, TOY.budget)))
+    assert same_demonstrations(read_hdf5(folder / "right_demo.hdf5", seen), before)
 
 
 def test_a_file_of_liberos_layout_is_read_in_the_order_of_its_numbers(libero: Path) -> None:
