@@ -247,14 +247,14 @@ def _statistics(
     columns: Columns, features: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, dict[str, list[Any]]]:
     """Return the statistics of condensed columns: per number, or per colour (3, 1, 1) from 0 to 1."""
-    statistics = {}
+    statistics: dict[str, dict[str, list[Any]]] = {}
     for name, values in columns.items():
         if features[name]["dtype"] == "image":
             found = {key: value.reshape(3, 1, 1) for key, value in _of_pictures(values).items()}
         else:
             found = _of_numbers(values.reshape(len(values), -1).astype(np.float64))
-        counts = {"count": [len(columns["index"])]}
-        statistics[name] = {**{key: value.tolist() for key, value in found.items()}, **counts}
+        statistics[name] = {key: value.tolist() for key, value in found.items()}
+        statistics[name]["count"] = [len(columns["index"])]
     return statistics
 
 
