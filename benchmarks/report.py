@@ -66,6 +66,13 @@ def _read(name: str) -> Any:
     return found
 
 
+def _measured(found: dict[str, Any]) -> str:
+    """Return when and on which processor results were measured; old results do not say when."""
+    hardware = found["hardware"]
+    date = [found["date"]] if "date" in found else []
+    return ", ".join([*date, f"{hardware['processor']} with {hardware['instructions']}"])
+
+
 def _ratio(ratio: dict[str, float] | None) -> str:
     if ratio is None:  # not compared
         return "-"
@@ -95,20 +102,21 @@ def _rollouts() -> Iterator[str]:
         "which is the upper limit. On LIBERO it is not: there, `mj_step` steps LIBERO's whole model, "
         "including the visual geoms, with the arm at rest. Of dm_control's three bodies, the row measures "
         "the ball in a cup, whose rewards are computed together; in our task, the cup is held to the right. "
-        "Steps per second are the steps of all environments together. Rows may come from different machines: "
-        "compare ratios, not steps."
+        "Steps per second are the steps of all environments together. Where rows come from different "
+        "machines, compare ratios, not steps."
     )
     yield ""
     one_thread = "clbench, one thread"
     others = ["AsyncVectorEnv", "SubprocVecEnv", "SyncVectorEnv of ours", one_thread, "mj_step"]
     yield from _table(
-        ["suite (peer)", "steps / s", "with one thread", *others],
+        ["suite (peer)", "steps / s", "with one thread", *others, "measured"],
         [
             [
                 f"{name} ({suite['peer']})",
                 str(suite["steps_per_second"]["clbench"]),
                 str(suite["steps_per_second"][one_thread]),
                 *(_ratio(suite["ratios_of_clbench_to"].get(other)) for other in others),
+                _measured(suite),
             ]
             for name, suite in suites.items()
         ],
@@ -121,12 +129,12 @@ def _whole_run() -> Iterator[str]:
     yield ""
     yield (
         "One thread. Data and pretrained policy are in the cache; the first evaluation, which the runs of a "
-        "seed share, is not. Rows may come from different machines: compare shares, not seconds."
+        "seed share, is not. Where rows come from different machines, compare shares, not seconds."
     )
     yield ""
     parts = list(next(iter(runs.values()))["parts"])
     yield from _table(
-        ["run", "seconds", *parts, "environment steps", "peak memory"],
+        ["run", "seconds", *parts, "environment steps", "peak memory", "measured"],
         [
             [
                 f"{name}, {run['method']}",
@@ -134,6 +142,7 @@ def _whole_run() -> Iterator[str]:
                 *(f"{run['parts'][part] / run['seconds']:.0%}" for part in parts),
                 f"{run['environment_steps']:,}",
                 f"{run['peak_memory_gb']:.2f} GB",
+                _measured(run),
             ]
             for name, run in runs.items()
         ],
@@ -147,7 +156,7 @@ def _steps() -> Iterator[str]:
     yield (
         f"Plain fine-tuning takes {1000 * steps['baseline_seconds_per_step']:.0f} ms per step. A bare "
         f"PyTorch loop on the same model and batches takes {_ratio(steps['bare_loop'])} of that time. Other "
-        "methods, as ratios:"
+        f"methods, as ratios ({_measured(steps)}):"
     )
     yield ""
     ratios = sorted(steps["ratios"].items(), key=lambda item: item[1]["median_ratio"])
@@ -167,7 +176,7 @@ def _workers() -> Iterator[str]:
         f"{_ratio(found['ray_to_many'])} times as long as {count} local workers ({seconds}). The "
         "records are the same. Each Ray worker keeps a process that has imported everything, and forks each "
         f"job from it. A cluster with these processes starts in {found['seconds_to_start'][ray]:.0f} s; the "
-        "times do not include that."
+        f"times do not include that. Measured: {_measured(found)}."
     )
     yield ""
 
@@ -179,7 +188,8 @@ def _served_policy() -> Iterator[str]:
     yield (
         "Behind a server on the same machine, the policy plays "
         f"{_ratio(found['served_to_in_process'])} times as many episodes per second as in the process that "
-        f"scores it, 40 in parallel. All {found['episodes']} outcomes are equal."
+        f"scores it, 40 in parallel. All {found['episodes']} outcomes are equal. "
+        f"Measured: {_measured(found)}."
     )
     yield ""
 
@@ -192,7 +202,7 @@ def _page() -> Iterator[str]:
     yield (
         f"A page of {found['rows']} rows with {found['seeds']} seeds each has {found['megabytes']:.2f} MB. "
         f"The board takes {board:.0f} s, and the page with its pictures {page:.0f} s; the goal is 20 s "
-        "together."
+        f"together. Measured: {_measured(found)}."
     )
     if "first_text_ms" in found:
         published, empty = found["first_text_ms"].values()
@@ -222,7 +232,10 @@ def _scaling() -> Iterator[str]:
             for name, one in found["measures"].items()
         ],
     )
-    yield f"Peak memory of all measurements together: {found['peak_memory_gb']:.2f} GB."
+    yield (
+        f"Peak memory of all measurements together: {found['peak_memory_gb']:.2f} GB. "
+        f"Measured: {_measured(found)}."
+    )
 
 
 def _milliseconds(seconds: float) -> str:

@@ -58,7 +58,7 @@ def main() -> None:
     if number is not None:
         _end_at_once_when_stopped()
         with contextlib.suppress(OSError):  # the terminal may be closed
-            print("Stopped. Finished records are kept; repeat the command to continue.", file=sys.stderr)  # noqa: T201
+            print("Stopped. Finished records are kept; repeat the command to do the rest.", file=sys.stderr)  # noqa: T201
         sys.exit(128 + number)
 
 
