@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from clbench.base.errors import ClbenchError, InputError
@@ -60,18 +61,14 @@ def learning_rate_factor(step: int, steps: int) -> float:
 def deterministic(device: str = "cpu") -> Iterator[None]:
     """Use one thread and deterministic kernels in the block, so that a computation repeats bit for bit.
 
-    The block also undoes what a program may have set for itself: gradients are on, and matrices of float32
-    are multiplied in float32 rather than in TF32 or bfloat16.
+    The block also undoes what a program may have set for itself: gradients are on, nothing is cast
+    automatically, all kernels of attention are allowed, and matrices of float32 are multiplied in float32
+    rather than in TF32 or bfloat16.
 
     Raises:
-        InputError: PyTorch's default dtype is not float32.
+        InputError: PyTorch's default dtype is not float32, or its default device is not the CPU.
     """
-    dtype = torch.get_default_dtype()
-    if dtype != torch.float32:  # the cached policies and evaluations serve all later runs
-        raise InputError(
-            f"PyTorch's default dtype is {dtype}, and clbench computes in torch.float32: call "
-            "torch.set_default_dtype(torch.float32) first."
-        )
+    _check_defaults()
     if device != "cpu":
         # with another workspace cuBLAS may choose another kernel each time
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
@@ -80,11 +77,39 @@ def deterministic(device: str = "cpu") -> Iterator[None]:
     torch.set_num_threads(1)
     torch.use_deterministic_algorithms(True)
     try:
-        with _full_precision(), torch.enable_grad():
+        with _usual_modes(torch.device(device).type), _full_precision():
             yield
     finally:
         torch.set_num_threads(threads)
         torch.use_deterministic_algorithms(algorithms, warn_only=warn_only)
+
+
+def _check_defaults() -> None:
+    """Refuse defaults with which the cached policies and evaluations, which serve all later runs, differ."""
+    dtype, device = torch.get_default_dtype(), torch.get_default_device()
+    if dtype != torch.float32:
+        raise InputError(
+            f"PyTorch's default dtype is {dtype}, and clbench computes in torch.float32: call "
+            "torch.set_default_dtype(torch.float32) first."
+        )
+    if device.type != "cpu":
+        raise InputError(
+            f"PyTorch's default device is {device}, and clbench places its tensors itself: call "
+            'torch.set_default_device("cpu") first. `device` of a run says where its policy computes.'
+        )
+
+
+@contextmanager
+def _usual_modes(kind: str) -> Iterator[None]:
+    """Undo the modes of PyTorch that change results: inference, gradients off, autocast, fewer kernels."""
+    kernels = set(SDPBackend.__members__.values()) - {SDPBackend.ERROR}
+    with ExitStack() as modes:
+        modes.enter_context(torch.inference_mode(False))
+        modes.enter_context(torch.enable_grad())
+        for one in {"cpu", kind}:
+            modes.enter_context(torch.autocast(one, enabled=False))
+        modes.enter_context(sdpa_kernel([*kernels]))
+        yield
 
 
 @contextmanager

@@ -69,7 +69,7 @@ def execute(
     Raises:
         CacheError: The file system refuses a checkpoint. The method has not failed, and there is no record.
         CheckpointError: A checkpoint of this run cannot be read.
-        InputError: PyTorch's default dtype is not float32.
+        InputError: PyTorch's default dtype is not float32, or its default device is not the CPU.
         LeaseLostError: Another process took over the run.
         MachineError: The machine has no room for a file of the method, or its disk or network fails.
         MissingPackageError: TensorBoard is not installed.

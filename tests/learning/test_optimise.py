@@ -1,4 +1,7 @@
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -6,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from clbench.base.errors import InputError
 from clbench.learning.optimise import (
     MethodError,
     deterministic,
@@ -190,6 +194,45 @@ def test_the_deterministic_block_multiplies_in_float32_although_the_program_allo
         torch.set_float32_matmul_precision("highest")
         matmul.fp32_precision = before
     assert torch.get_float32_matmul_precision() == "highest"
+
+
+@contextmanager
+def _without_flash_attention() -> Iterator[None]:
+    torch.backends.cuda.enable_flash_sdp(False)
+    try:
+        yield
+    finally:
+        assert not torch.backends.cuda.flash_sdp_enabled()  # type: ignore[no-untyped-call]
+        torch.backends.cuda.enable_flash_sdp(True)
+
+
+@pytest.mark.parametrize(
+    "mode",
+    [partial(torch.autocast, "cpu", dtype=torch.bfloat16), _without_flash_attention, torch.inference_mode],
+    ids=["autocast", "other attention", "inference"],
+)
+def test_modes_of_the_program_do_not_change_what_the_deterministic_block_computes(mode: Any) -> None:
+    def gradient() -> Tensor:
+        weight = torch.linspace(-1, 1, 4 * 16).reshape(1, 1, 4, 16).requires_grad_()
+        attended = nn.functional.scaled_dot_product_attention(weight, weight @ weight.mT @ weight, weight)
+        return torch.autograd.grad(attended.square().sum(), weight)[0]
+
+    with deterministic():
+        expected = gradient()
+    with mode(), deterministic():
+        found = gradient()
+    assert found.dtype == torch.float32
+    assert not found.is_inference()
+    assert torch.equal(found, expected)
+
+
+def test_a_default_device_other_than_the_cpu_is_refused() -> None:
+    torch.set_default_device("meta")
+    try:
+        with pytest.raises(InputError, match=r"default device is meta.*set_default_device"), deterministic():
+            pass
+    finally:
+        torch.set_default_device(None)
 
 
 def test_the_deterministic_block_has_gradients_although_the_program_turned_them_off() -> None:
