@@ -26,7 +26,8 @@ from clbench.spec.limits import Limits
 from clbench.worlds.threads import cores, threads_of_job
 
 JOBS = """
-import asyncio, multiprocessing, os, signal, subprocess, threading, time
+import asyncio, gc, multiprocessing, os, signal, struct, subprocess, threading, time
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 from clbench.worlds.threads import Team
@@ -77,6 +78,13 @@ def names_its_gpu(progress):
 def ends_by(progress, number):
     os.kill(os.getpid(), number)
     time.sleep(600)
+
+def dies_in_a_message(progress):
+    # the length of a message and its first bytes, as a process leaves them that is killed while it writes
+    is_open = lambda one: type(one) is Connection and not one.closed and one.writable
+    for connection in filter(is_open, gc.get_objects()):
+        os.write(connection.fileno(), struct.pack("!i", 1000) + bytes(10))
+    os.kill(os.getpid(), signal.SIGKILL)
 
 def interrupts(progress):
     raise KeyboardInterrupt("of its own")
@@ -141,6 +149,11 @@ def test_a_job_whose_forked_child_lives_on_is_lost_at_once(tmp_path: Path, bars:
 def test_a_job_that_a_signal_ends_is_lost_with_its_name_or_number(number: int, name: str, bars: Bars) -> None:
     (reason,) = run_jobs([_job("ends_by", number=number)], Processes(1), bars).values()
     assert reason == f"its process ended without a result (exit code -{number}, {name})"
+
+
+def test_a_job_that_dies_in_the_middle_of_a_message_is_lost(bars: Bars) -> None:
+    (reason,) = run_jobs([_job("dies_in_a_message")], Processes(1), bars).values()
+    assert reason == "its process ended without a result (exit code -9, SIGKILL)"
 
 
 def test_closing_ends_a_job_that_ignores_it_and_its_children(
