@@ -41,8 +41,8 @@ autodoc_member_order = "bysource"
 
 html_theme = "furo"
 html_title = "clbench"
-html_static_path = ["notebooks/outputs.css"]
-html_css_files = ["outputs.css"]
+html_static_path = ["site.css"]
+html_css_files = ["site.css"]
 html_theme_options = {
     "source_repository": "https://github.com/clbench/clbench",
     "source_branch": "main",
