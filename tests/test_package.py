@@ -54,3 +54,12 @@ def test_the_records_of_the_board_come_with_clbench() -> None:
     assert len(list((published / "Fetch-v1").rglob("seed-*.json"))) >= 88
     tied = published.parent / "ladder" / "Fetch-v1" / "sft+step_factor=0.1"
     assert len(list(tied.glob("seed-*.json"))) == 12  # without them, no gain over sft is certain
+
+
+def test_the_pictures_of_the_scenario_cards_come_with_clbench() -> None:
+    module = "clbench.leaderboard.views.page.stills"
+    stills, film = resolve(f"{module}:stills"), resolve(f"{module}:film")
+    for name in ("clbench/Fetch-v1", "clbench/MetaWorld-v1", "clbench/PointMaze-v1"):  # they need no extra
+        tasks = [task.name for task in clbench.load_scenario(name).tasks]
+        assert list(stills(name, tasks)) == tasks
+    assert film("clbench/Fetch-v1").startswith("data:image/gif")

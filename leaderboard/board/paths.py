@@ -15,7 +15,7 @@ LADDER = Path("leaderboard/ladder")
 """Folder of records with the learning rates of the ladder, next to the folder of records."""
 
 CARDS = Path(__file__).parents[2] / "docs/reference/scenarios"
-"""Folder of the scenario cards, beside the code. An installed wheel has none."""
+"""Folder of the scenario cards, beside the code. An installed wheel has their pictures alone."""
 
 FILM = "film.gif"
 """File with a film of a scenario, in the folder of its card; `clbench film --output` makes it."""
