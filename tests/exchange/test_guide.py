@@ -55,7 +55,7 @@ def test_its_export_with_pictures_is_a_command(
     with pytest.raises(SystemExit):
         app([*command[:-1], str(tmp_path)])
     assert f"{tmp_path} already exists: name a new folder for the export" in capsys.readouterr().err
-    # the cameras are those of the scene, and another name would be refused before any work
+    # the scene has these cameras: an unknown name would be refused before any work
     place = command.index("--pictures") + 1
     with pytest.raises(SystemExit):
         app([*command[:place], f"{command[place]},agent", *command[place + 1 : -1], str(tmp_path / "new")])
